@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one record every message family becomes, and the one error a bad message raises.
+
+Shapes: N persons, P keypoints, point-major (N, P, 2). Pixels, x right, y down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+#: A coordinate beyond this many pixels is no pixel: the point counts as missing.
+ABSURD_PIXELS = 1e6
+
+
+class MessageError(ValueError):
+    """A message that cannot be used. ``reason`` is a short slug to count by; the text says what to do."""
+
+    def __init__(self, reason: str, advice: str) -> None:
+        super().__init__(advice)
+        self.reason = reason
+
+
+class WrongPointCount(MessageError):
+    """The message has another number of keypoints than the layout. ``fits(points)`` tells which would do."""
+
+    def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
+        super().__init__('wrong_point_count', advice)
+        self.fits = fits
+
+
+def split_persons(total: int, points: int) -> int:
+    """How many persons of `points` keypoints a flat list of `total` keypoints holds.
+
+    Raises WrongPointCount where it holds no whole number of persons.
+    """
+    if total % points:
+        raise WrongPointCount(f'{total} keypoints are no multiple of the {points} of the layout',
+                              lambda other: total % other == 0)
+    return total // points
+
+
+@dataclass(frozen=True)
+class Keypoints2D:
+    """The 2D keypoints of all persons in one image.
+
+    xy: (N, P, 2) float64 pixels, NaN where missing.
+    confidence: (N, P) float64 in 0..1, 1 where the message has none, 0 where missing.
+    visible: (N, P) bool.
+    ids: N person ids as text, '' where unknown.
+    stamp: nanoseconds, from the message's header.
+    frame_id: from the message's header.
+    """
+
+    xy: np.ndarray
+    confidence: np.ndarray
+    visible: np.ndarray
+    ids: tuple[str, ...]
+    stamp: int
+    frame_id: str
+
+    @property
+    def persons(self) -> int:
+        """How many persons the image shows (N)."""
+        return self.xy.shape[0]
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion: focal lengths, principal point and image size, all in pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+def stamp_ns(header) -> int:
+    """The header's stamp in nanoseconds."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def record(xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header,
+           present: np.ndarray | None = None) -> Keypoints2D:
+    """Makes the record from raw arrays: what no camera can have seen becomes missing.
+
+    xy (N, P, 2) in any real type; confidence (N, P) or None where the message has none; present (N, P) bool
+    or None where the family marks missing points only by their values. A point is missing where `present`
+    says so, where x or y is not finite or beyond ABSURD_PIXELS, or where its confidence is not finite.
+    Confidences are clipped to 0..1: some detectors' peaks reach a little above one.
+    """
+    xy = np.array(xy, dtype=np.float64)
+    with np.errstate(invalid='ignore'):
+        visible = (np.abs(xy) <= ABSURD_PIXELS).all(axis=-1)
+    if present is not None:
+        visible &= present
+    if confidence is None:
+        confidence = np.ones(visible.shape)
+    else:
+        confidence = np.asarray(confidence, dtype=np.float64)
+        visible &= np.isfinite(confidence)
+    xy[~visible] = np.nan
+    confidence = np.where(visible, np.clip(confidence, 0.0, 1.0), 0.0)
+    return Keypoints2D(xy, confidence, visible, ids, stamp_ns(header), str(header.frame_id))

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""yolo_msgs/DetectionArray (yolo_ros): pixels, ids where tracking is on.
+
+A detection's keypoint list is sparse and its ids are 1-based: a point is placed by its id, never by its
+position. Exactly (0, 0) is the detector's way to say missing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from msg_adapters.keypoints import Keypoints2D, MessageError, WrongPointCount, record
+
+
+def read(msg, points: int) -> Keypoints2D:
+    """Reads detections as persons of a layout with `points` keypoints.
+
+    A detection without keypoints is a person of whom no point is visible.
+    Raises MessageError: wrong_point_count (an id beyond the layout), wrong_keypoint_id (an id below 1).
+    """
+    persons = len(msg.detections)
+    xy = np.zeros((persons, points, 2))
+    confidence = np.zeros((persons, points))
+    for person, detection in enumerate(msg.detections):
+        for keypoint in detection.keypoints.data:
+            column = _column(int(keypoint.id), points)
+            xy[person, column] = keypoint.point.x, keypoint.point.y
+            confidence[person, column] = keypoint.score
+    ids = tuple(str(detection.id) for detection in msg.detections)
+    return record(xy, confidence, ids, msg.header, present=(xy != 0).any(axis=-1))
+
+
+def _column(keypoint_id: int, points: int) -> int:
+    """The layout's column of a 1-based keypoint id."""
+    if keypoint_id < 1:
+        raise MessageError('wrong_keypoint_id', f'keypoint id {keypoint_id}; yolo_msgs counts from 1')
+    if keypoint_id > points:
+        raise WrongPointCount(f'keypoint id {keypoint_id} is beyond the {points} keypoints of the layout',
+                              lambda other: other >= keypoint_id)
+    return keypoint_id - 1

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Lifter: 2D keypoints of single frames to 3D points in the camera frame, with error, ambiguity and units stated."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_adapters.keypoints import Intrinsics
+from paul_ros.model import Model
+from paul_ros.onp import onp
+from paul_ros.placement import centred_view, place
+
+TOO_FEW_POINTS = "too_few_points"
+DEGENERATE_POINTS = "degenerate_points"
+
+AMBIGUOUS = 0.9
+"""From this ambiguity on the mirrored pose explains the image nearly as well."""
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """N persons in 3D.
+
+    Attributes:
+        points: (N,P,3) camera optical frame (x right, y down, z forward). In metres from the camera's centre where
+            ``units`` is ``"m"``; else in model units from the root. NaN for persons that were not lifted.
+        root: (N,3) the layout's root point, same frame and units.
+        rotation: (N,3,3) canonical frame to camera frame, det +1.
+        scale: (N,) pixels per model unit (at the person's distance).
+        reprojection: (N,) pixels, root mean square over the visible points under weak perspective.
+        ambiguity: (N,) 0..1, residual of the pose over that of its mirrored rival; 1 means undecidable.
+        certified: (N,) the pose is the proven optimum of orthographic-N-point.
+        reason: N slugs, '' where lifted, else why not.
+        units: ``"m"`` or ``"model"``.
+    """
+
+    points: np.ndarray
+    root: np.ndarray
+    rotation: np.ndarray
+    scale: np.ndarray
+    reprojection: np.ndarray
+    ambiguity: np.ndarray
+    certified: np.ndarray
+    reason: tuple[str, ...]
+    units: str
+
+    @property
+    def ok(self) -> np.ndarray:
+        """(N,) bool: lifted."""
+        return np.array([not reason for reason in self.reason], bool)
+
+
+class Lifter:
+    """Lifts every person of every frame on its own: encode, decode, orthographic-N-point, placement.
+
+    Section 4.2 of the paper, "Prediction on unseen data".
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+
+    def lift(self, xy: np.ndarray, visible: np.ndarray, camera: Intrinsics | None = None) -> Lifted:
+        """Lift N persons.
+
+        Args:
+            xy: (N,P,2) pixels in the model's layout; anything, NaN too, where hidden.
+            visible: (N,P) bool.
+            camera: intrinsics of the (rectified) image; with them, and a model that knows its metres per unit, the
+                output is in metres.
+
+        Raises:
+            ValueError: the arrays do not have these shapes.
+        """
+        xy, visible = self._checked(xy, visible)
+        reason = np.where(visible.sum(1) < self.model.min_visible, TOO_FEW_POINTS, "").astype(object)
+        lifted = _nothing(len(xy), xy.shape[1], "m" if camera and self.model.metres_per_unit else "model")
+        rows = np.flatnonzero(reason == "")
+        if len(rows):
+            reason[rows] = self._lift_rows(xy[rows], visible[rows], camera, rows, lifted)
+        return Lifted(**lifted, reason=tuple(reason.tolist()))
+
+    def _checked(self, xy: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        xy, visible = np.asarray(xy, float), np.asarray(visible, bool)
+        P = len(self.model.layout.names)
+        if xy.ndim != 3 or xy.shape[1:] != (P, 2) or visible.shape != xy.shape[:2]:
+            raise ValueError(
+                f"lift needs xy (N,{P},2) and visible (N,{P}) in layout '{self.model.layout.name}', "
+                f"got {xy.shape} and {visible.shape}"
+            )
+        return xy, visible & np.isfinite(xy).all(2)
+
+    def _lift_rows(self, xy, visible, camera, rows, lifted) -> np.ndarray:
+        """Fill the given rows of the output arrays; returns the reasons of those that came out undetermined."""
+        if camera is None:
+            W, turn, pixels = xy.transpose(0, 2, 1), None, 1.0
+        else:
+            view = centred_view(xy, visible, camera)
+            W, turn, pixels = view.W, view.turn, (camera.fx + camera.fy) / 2
+            visible = visible & np.isfinite(W).all(1)
+        S = self.model.shape(W, visible).astype(float)
+        pose = onp(S, W, visible)
+        good = pose.determined & (pose.scale > 0)
+        camera_shape = pose.R @ S
+        root = list(self.model.layout.root)
+        if lifted["units"] == "m":
+            scale = np.where(good, pose.scale, 1.0)
+            points = place(camera_shape, scale, pose.translation, turn, self.model.metres_per_unit)
+            rotation = turn @ pose.R
+        else:
+            points = (camera_shape - camera_shape[:, :, root].mean(2, keepdims=True)).transpose(0, 2, 1)
+            rotation = pose.R if turn is None else turn @ pose.R
+        done, rows = good, rows[good]
+        lifted["points"][rows] = points[done]
+        lifted["root"][rows] = points[done][:, root].mean(1)
+        lifted["rotation"][rows] = rotation[done]
+        lifted["scale"][rows] = pose.scale[done] * pixels
+        lifted["reprojection"][rows] = pose.residual[done] * pixels
+        lifted["ambiguity"][rows] = pose.ambiguity[done]
+        lifted["certified"][rows] = pose.certified[done]
+        return np.where(good, "", DEGENERATE_POINTS)
+
+
+def _nothing(N: int, P: int, units: str) -> dict:
+    """Output arrays of N persons, none lifted yet."""
+    return dict(
+        points=np.full((N, P, 3), np.nan),
+        root=np.full((N, 3), np.nan),
+        rotation=np.tile(np.eye(3), (N, 1, 1)),
+        scale=np.full(N, np.nan),
+        reprojection=np.full(N, np.nan),
+        ambiguity=np.full(N, np.nan),
+        certified=np.zeros(N, bool),
+        units=units,
+    )

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model file: load, check, save; and the forward pass from 2D points to a canonical 3D shape, in plain numpy.
+
+A model file is an ``.npz`` archive of float32 weights, the mean shape and one JSON header.  Its last 64 bytes (the zip
+comment) are the SHA-256 of all bytes before them, so that any change to the file is noticed.  Nothing is unpickled.
+"""
+from __future__ import annotations
+
+import difflib
+import hashlib
+import io
+import json
+import math
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from paul_ros.skeleton import Layout, LayoutError
+
+FORMAT_VERSION = 1
+DEFAULT_MODEL = "human_coco17"
+_DIGEST_CHARS = 64
+_MAX_BYTES = 64 * 2**20
+
+
+class ModelError(ValueError):
+    """A model that cannot be used; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained shape model: 2D encoder h and shape decoder f_d of the paper's sections 3 and 4.
+
+    Attributes:
+        name: file name without suffix.
+        header: what the file says of itself (layout, architecture, chirality, units, training provenance).
+        layout: the keypoints it was trained on.
+        weights: float32 arrays by name.
+        mean_shape: (3,P) canonical frame, model units.
+        sha256: digest of the file, hex.
+    """
+
+    name: str
+    header: dict
+    layout: Layout
+    weights: dict[str, np.ndarray]
+    mean_shape: np.ndarray
+    sha256: str
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Metres per model unit, None where unknown: such output has no metric scale."""
+        return self.header["metres_per_unit"]
+
+    @property
+    def min_visible(self) -> int:
+        """Fewer visible points than this are not lifted: the shape would be mostly guessed."""
+        return min_visible(len(self.layout.names))
+
+    def encode(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """h(W, M): codes (N,K) of image points (N,2,P) in any unit and position; hidden ones are ignored."""
+        x = np.concatenate([normalise(W, visible).reshape(len(W), -1), visible], axis=1).astype(np.float32)
+        x = _relu(self._linear("encoder.input", x))
+        for block in range(self.header["architecture"]["encoder"]["blocks"]):
+            inner = _relu(self._linear(f"encoder.blocks.{block}.first", x))
+            x = x + _relu(self._linear(f"encoder.blocks.{block}.second", inner))
+        return self._linear("encoder.output", x)
+
+    def decode(self, code: np.ndarray) -> np.ndarray:
+        """f_d(phi): canonical shapes (N,3,P) in model units of codes (N,K)."""
+        x = np.asarray(code, np.float32)
+        layers = len(self.header["architecture"]["decoder"]["hidden"])
+        for layer in range(layers):
+            x = _elu(self._linear(f"decoder.{layer}", x))
+        return to_unit_size(self._linear(f"decoder.{layers}", x).reshape(len(x), 3, -1), self.layout)
+
+    def shape(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """f_d(h(W, M)): canonical shapes (N,3,P) in model units of image points (N,2,P)."""
+        return self.decode(self.encode(W, visible))
+
+    def rigid(self) -> RigidModel:
+        """The baseline that always answers with the mean shape."""
+        return RigidModel(**vars(self))
+
+    def check_layout(self, layout: Layout) -> None:
+        """Refuse data of another layout.
+
+        Raises:
+            ModelError: the names or their order differ.
+        """
+        if layout.names != self.layout.names:
+            raise ModelError(
+                f"model '{self.name}' was trained on layout '{self.layout.name}' ({len(self.layout.names)} points), "
+                f"the data is '{layout.name}' ({len(layout.names)} points): map it with Layout.map_to, "
+                f"or train a model on it with `paul train`"
+            )
+
+    def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
+        return x @ self.weights[f"{name}.weight"].T + self.weights[f"{name}.bias"]
+
+
+class RigidModel(Model):
+    """A model whose every shape is the mean shape: what a rigid object would be lifted to."""
+
+    def shape(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self.mean_shape, (len(W), *self.mean_shape.shape))
+
+
+def min_visible(points: int) -> int:
+    """Fewest visible points out of P that are lifted: 30 % of them, at least 4."""
+    return min(points, max(4, math.ceil(0.3 * points)))
+
+
+def normalise(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Image points (N,2,P) centred on the mean of the visible ones, their root mean square distance 1; hidden ones 0."""
+    seen = visible[:, None, :]
+    count = np.maximum(visible.sum(1), 1)[:, None, None]
+    W = np.where(seen, W, 0.0)
+    W = np.where(seen, W - W.sum(2, keepdims=True) / count, 0.0)
+    size = np.sqrt((W**2).sum((1, 2), keepdims=True) / count)
+    return W / np.where(size > 0, size, 1.0)
+
+
+def to_unit_size(S: np.ndarray, layout: Layout) -> np.ndarray:
+    """Shapes (N,3,P) centred on their mean, in model units.
+
+    The size of a shape seen by weak perspective is free.  Where the layout has edges the mean edge length is 1, because
+    bones keep their lengths when a body moves; else the root mean square distance to the centre is 1.
+    """
+    S = S - S.mean(2, keepdims=True)
+    if layout.edges:
+        start, end = np.array(layout.edges).T
+        size = np.linalg.norm(S[:, :, start] - S[:, :, end], axis=1).mean(1)
+    else:
+        size = np.sqrt((S**2).sum((1, 2)) / S.shape[2])
+    return S / np.maximum(size, 1e-6)[:, None, None]
+
+
+def _relu(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, 0)
+
+
+def _elu(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+
+
+def model_names() -> list[str]:
+    """Names of the shipped models."""
+    folder = resources.files("paul_ros") / "models"
+    return sorted(item.name[:-4] for item in folder.iterdir() if item.name.endswith(".npz"))
+
+
+def load_model(name_or_path: str | os.PathLike = DEFAULT_MODEL) -> Model:
+    """Load and check a shipped model by name, or any model file by path.
+
+    Raises:
+        ModelError: no such model; damaged; of another format version; not a model file.
+    """
+    path = _find(name_or_path)
+    data = path.read_bytes()
+    name = Path(path.name).stem
+    where = f"model file '{name_or_path}'"
+    if len(data) <= _DIGEST_CHARS or not data.startswith(b"PK"):
+        raise ModelError(f"{where} is no model file (expected the .npz that `paul train` writes)")
+    digest = hashlib.sha256(data[:-_DIGEST_CHARS]).hexdigest()
+    if data[-_DIGEST_CHARS:] != digest.encode():
+        raise ModelError(f"{where} is damaged (its checksum does not match): copy it again or export it anew")
+    try:
+        arrays = _read_arrays(data)
+        header = json.loads(bytes(arrays.pop("header")).decode())
+    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+        raise ModelError(f"{where} is no model file: {error}") from error
+    if header.get("format") != FORMAT_VERSION:
+        raise ModelError(
+            f"{where} has format version {header.get('format')}, this paul_ros reads {FORMAT_VERSION}: "
+            f"export it anew with `paul train`, or install the paul_ros that wrote it"
+        )
+    try:
+        layout = Layout.from_dict(header["layout"])
+        _check_arrays(header, layout, arrays)
+    except (KeyError, TypeError, ValueError, LayoutError) as error:
+        raise ModelError(f"{where} does not fit its own header: {error}") from error
+    return Model(name, header, layout, arrays, arrays.pop("mean_shape"), digest)
+
+
+def _find(name_or_path: str | os.PathLike):
+    text = os.fspath(name_or_path)
+    if text in model_names():
+        return resources.files("paul_ros") / "models" / f"{text}.npz"
+    path = Path(text)
+    if not path.is_file():
+        near = difflib.get_close_matches(text, model_names(), n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"shipped models: {', '.join(model_names())}"
+        raise ModelError(f"no model '{text}': neither a file nor a shipped model; {hint}")
+    if path.stat().st_size > _MAX_BYTES:
+        raise ModelError(f"model file '{text}' is larger than {_MAX_BYTES >> 20} MiB: not a paul_ros model")
+    return path
+
+
+def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(item.file_size for item in archive.infolist()) > 4 * _MAX_BYTES:
+            raise ValueError("it unpacks to more than a model can hold")
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def weight_shapes(header: dict, points: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of all arrays that a model with this header and P points must hold."""
+    encoder, hidden, K = header["architecture"]["encoder"], header["architecture"]["decoder"]["hidden"], header["bottleneck"]
+    width = encoder["width"]
+    layers = {"encoder.input": (width, 3 * points), "encoder.output": (K, width)}
+    for block in range(encoder["blocks"]):
+        layers[f"encoder.blocks.{block}.first"] = layers[f"encoder.blocks.{block}.second"] = (width, width)
+    sizes = [K, *hidden, 3 * points]
+    for layer, (inputs, outputs) in enumerate(zip(sizes, sizes[1:])):
+        layers[f"decoder.{layer}"] = (outputs, inputs)
+    shapes: dict[str, tuple[int, ...]] = {"mean_shape": (3, points)}
+    for name, size in layers.items():
+        shapes[f"{name}.weight"], shapes[f"{name}.bias"] = size, size[:1]
+    return shapes
+
+
+def _check_arrays(header: dict, layout: Layout, arrays: dict[str, np.ndarray]) -> None:
+    metres = header["metres_per_unit"]
+    if metres is not None and not (isinstance(metres, float) and math.isfinite(metres) and metres > 0):
+        raise ValueError(f"metres_per_unit is {metres!r}")
+    expected = weight_shapes(header, len(layout.names))
+    if set(expected) != set(arrays):
+        raise ValueError(f"arrays missing or unknown: {', '.join(sorted(set(expected) ^ set(arrays)))}")
+    for name, shape in expected.items():
+        if arrays[name].dtype != np.float32 or arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+            raise ValueError(f"array {name} is not finite float32 of shape {shape}")
+
+
+def save_model(path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray]) -> None:
+    """Write a model file atomically.
+
+    Args:
+        path: where to; an existing file is replaced only once the new one is complete.
+        header: see the class; ``format`` is filled in.
+        arrays: float32, named and shaped as ``weight_shapes`` says, and ``mean_shape`` (3,P).
+
+    Raises:
+        ModelError: header and arrays do not fit together.
+    """
+    header = {"format": FORMAT_VERSION, **header}
+    arrays = {name: np.asarray(value, np.float32) for name, value in arrays.items()}
+    try:
+        _check_arrays(header, Layout.from_dict(header["layout"]), arrays)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelError(f"not saved, the model does not fit its own header: {error}") from error
+    text = json.dumps(header, indent=1, sort_keys=True).encode()
+    buffer = io.BytesIO()
+    np.savez(buffer, header=np.frombuffer(text, np.uint8), **arrays)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.comment = b"0" * _DIGEST_CHARS
+    body = buffer.getvalue()[:-_DIGEST_CHARS]
+    write_atomically(path, body + hashlib.sha256(body).hexdigest().encode())
+
+
+def write_atomically(path: str | os.PathLike, data: bytes) -> None:
+    """Write a file that is there whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise

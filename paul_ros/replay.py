@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording lifted in code, message by message, through the same path as the node, and judged against its truth.
+
+Equal input gives an equal lifted bag, byte for byte. Nothing is dropped for want of time, as a live replay would.
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import platform
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Callable
+
+import numpy as np
+
+import msg_adapters
+from msg_adapters import Intrinsics, Keypoints2D
+from msg_adapters.keypoints import stamp_ns
+from paul_ros import __version__, metrics
+from paul_ros.bag import LATCHED_QOS, BagError, BagMessages, BagWriter, Record, read_records, topics_of
+from paul_ros.lifter import AMBIGUOUS, Lifted, Lifter
+from paul_ros.model import load_model
+from paul_ros.parameters import PARAMETERS
+from paul_ros.skeleton import Mapping, load_layout
+from paul_ros.stream import LiftStream
+
+NODE = '/lifter'
+"""Output topics lie below this name, as those of the node of that name do."""
+ERRORS = ('n_mpjpe_mm', 'pa_mpjpe_mm', 'ne_flip_frame_percent', 'ne_flip_global_percent', 'root_error_median_mm',
+          'root_error_median_percent')
+"""The error keys of a report, and of the baseline in it."""
+
+CAMERA_INFO, POSE_ARRAY = 'sensor_msgs/msg/CameraInfo', 'geometry_msgs/msg/PoseArray'
+_MM = 1000.0
+
+
+class WrongTopic(BagError):
+    """A topic that was asked for is of a type that cannot be used."""
+
+
+@dataclass(frozen=True)
+class Topics:
+    """What is read from the bag; the defaults are those of the bags in bags/."""
+
+    keypoints: str = '/keypoints'
+    camera_info: str = '/camera_info'
+    truth: str = '/ground_truth/poses'
+
+    @property
+    def all(self) -> tuple[str, str, str]:
+        return self.keypoints, self.camera_info, self.truth
+
+
+@dataclass(frozen=True)
+class LiftedFrame:
+    """One message: its N persons in the model's layout in 2D and lifted, and what the camera was then."""
+
+    stamp: int  # ns
+    keypoints: Keypoints2D
+    lifted: Lifted
+    camera: Intrinsics | None
+
+
+@dataclass
+class Replay:
+    """A replayed bag.
+
+    frames: in the bag's order. truth: stamp -> (N,P,3) metres, camera frame, in the model's layout; row i is the person
+    of row i of the keypoints of that stamp. damage: what was wrong with the bag; then only what lies before it is here.
+    """
+
+    bag: Path
+    stream: LiftStream
+    frames: list[LiftedFrame] = field(default_factory=list)
+    truth: dict[int, np.ndarray] = field(default_factory=dict)
+    damage: BagError | None = None
+
+
+def open_stream(model: str | None = None, layout: str | None = None) -> LiftStream:
+    """The stream that the node makes of the same parameters; None = the node's default.
+
+    Raises ModelError, LayoutError.
+    """
+    default = {parameter.name: parameter.default for parameter in PARAMETERS}
+    loaded = load_model(model or default['model'])
+    return LiftStream(Lifter(loaded), load_layout(layout) if layout else loaded.layout,
+                      default['min_confidence'], default['max_persons'])
+
+
+def replay(bag: Path, stream: LiftStream, out: Path | None = None, topics: Topics = Topics(),
+           on_frame: Callable[[], None] = lambda: None) -> Replay:
+    """Lift every keypoint message of a bag; write input and output topics to the bag `out`, if given.
+
+    A bag damaged somewhere in the middle is lifted up to there: `out` is then whole and says what was read, and the
+    result names the damage. Raises BagError where nothing can be read, or nothing there is to be lifted.
+    """
+    if out is not None and bag.exists() and out.resolve() == bag.resolve():
+        raise BagError(f'{out}: is the bag that is read; name another output')
+    done = Replay(bag, stream)
+    with BagWriter(out) if out else contextlib.nullcontext() as writer:
+        shell = _Shell(done, topics, writer)
+        try:
+            for record in read_records(bag, topics.all):
+                if shell.take(record):
+                    on_frame()
+        except BagError as error:
+            if not done.frames or isinstance(error, WrongTopic):
+                raise
+            done.damage = error
+        if not shell.keypoint_messages:
+            raise BagError(_nothing_there(bag, topics))
+    return done
+
+
+class _Shell:
+    """Hands records to the stream and what comes back to the writer; the node's counterpart."""
+
+    def __init__(self, done: Replay, topics: Topics, writer: BagWriter | None):
+        self.done, self.topics, self.writer = done, topics, writer
+        self.keypoint_messages = 0
+        self._make = BagMessages()
+        self._described: dict = {}
+
+    def take(self, record: Record) -> bool:
+        """True where the record was a keypoint message."""
+        if self.writer:
+            self.writer.write_record(record)
+        if record.topic == self.topics.camera_info:
+            self.done.stream.camera_info(_decoded(record, CAMERA_INFO, '--camera-info-topic'))
+        elif record.topic == self.topics.truth:
+            self._take_truth(_decoded(record, POSE_ARRAY, '--ground-truth-topic'))
+        else:
+            self._take_keypoints(record)
+            return True
+        return False
+
+    def _take_keypoints(self, record: Record) -> None:
+        self.keypoint_messages += 1
+        stream = self.done.stream
+        frame = stream.keypoints(record.type_name, _decoded(record, tuple(msg_adapters.SUPPORTED), '--topic'))
+        self._write_layout(record.log_time)
+        if frame is None:
+            return
+        self.done.frames.append(LiftedFrame(frame.keypoints.stamp, frame.keypoints, frame.lifted, stream.intrinsics))
+        if self.writer:
+            for name, message in frame.messages(self._make).items():
+                self.writer.write(f'{NODE}/{name}', message, record.log_time)
+
+    def _take_truth(self, message: object) -> None:
+        stream = self.done.stream
+        flat = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses], float).reshape(-1, 3)
+        points = len(stream.layout.names)
+        if len(flat) % points:
+            stream.drops['truth_wrong_point_count'] += 1
+            return
+        mapping = stream.layout.map_to(stream.lifter.model.layout)
+        self.done.truth[stamp_ns(message.header)] = map_points(mapping, flat.reshape(-1, points, 3))
+
+    def _write_layout(self, log_time: int) -> None:
+        described = self.done.stream.describe()
+        if self.writer and described != self._described:
+            self._described = described
+            message = self._make('std_msgs/msg/String', data=json.dumps(described))
+            self.writer.write(f'{NODE}/layout', message, log_time, LATCHED_QOS)
+
+
+def map_points(mapping: Mapping, points: np.ndarray) -> np.ndarray:
+    """3D points (N,P,3) of a mapping's source layout in its target's points; NaN for those that the source lacks."""
+    mapped = np.full((len(points), len(mapping.sources), 3), np.nan)
+    for index, parts in enumerate(mapping.sources):
+        if parts:
+            mapped[:, index] = points[:, list(parts)].mean(axis=1)
+    return mapped
+
+
+def _decoded(record: Record, expected: str | tuple[str, ...], option: str) -> object:
+    if record.type_name not in ([expected] if isinstance(expected, str) else expected):
+        wanted = expected if isinstance(expected, str) else ' or '.join(expected)
+        raise WrongTopic(f'{record.topic} is a {record.type_name}, not {wanted}: choose another with {option}')
+    return record.message()
+
+
+def _nothing_there(bag: Path, topics: Topics) -> str:
+    held = [f'{topic} ({kind})' for topic, (kind, _) in topics_of(bag).items()]
+    return (f'{bag}: no messages on {topics.keypoints}; the bag holds {", ".join(held) or "none at all"}. '
+            'Choose one with --topic')
+
+
+# --- judging
+
+
+def evaluate(done: Replay) -> dict:
+    """The report of a replay: the fixed keys of `paul replay --json` and some more; None where there is no truth.
+
+    Shape errors are over all P points, hidden ones too, of every person that was lifted and has a ground truth.
+    NE and the position of the root need metric output, so they are None in model units.
+    """
+    stream = done.stream
+    model = stream.lifter.model
+    lifts = [frame.lifted for frame in done.frames]
+    ok = [lifted.ok for lifted in lifts]
+    times = np.array(stream.lift_us) if stream.lift_us else np.full(1, np.nan)
+    return {
+        'bag': str(done.bag),
+        'frames': stream.counts['frames'],
+        'persons': stream.counts['persons'],
+        'lifted': stream.counts['lifted'],
+        'dropped': dict(sorted(stream.drops.items())),
+        'units': stream.units,
+        **errors(with_truth(done, done.frames), model.layout.root),
+        'reprojection_median_px': _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),
+        'certified_share': _mean([lift.certified[good] for lift, good in zip(lifts, ok)]),
+        'ambiguous_share': _mean([lift.ambiguity[good] >= AMBIGUOUS for lift, good in zip(lifts, ok)]),
+        'lift_us_median': _number(np.median(times)),
+        'lift_us_p99': _number(np.percentile(times, 99)),
+        'baseline': errors(with_truth(done, rigid_frames(done)), model.layout.root),
+        'model': model.name,
+        'model_sha256': model.sha256,
+        'layout': model.layout.name,
+        'damage': str(done.damage) if done.damage else None,
+        'versions': versions(),
+    }
+
+
+def rigid_frames(done: Replay) -> list[LiftedFrame]:
+    """The same frames lifted with the model's mean shape, the baseline."""
+    rigid = Lifter(done.stream.lifter.model.rigid())
+    return [replace(frame, lifted=rigid.lift(frame.keypoints.xy, frame.keypoints.visible, frame.camera))
+            for frame in done.frames]
+
+
+def with_truth(done: Replay, frames: list[LiftedFrame]) -> list[tuple[Lifted, np.ndarray]]:
+    """(Lifted of N persons, their truth (N,P,3)) of the frames whose stamp has a truth."""
+    return [(frame.lifted, done.truth[frame.stamp]) for frame in frames if frame.stamp in done.truth]
+
+
+def errors(pairs: list[tuple[Lifted, np.ndarray]], root: tuple[int, ...]) -> dict:
+    """Errors of lifted persons against truth; pairs of (Lifted of N persons, truth (N,P,3) in metres)."""
+    predicted, truth = matched(pairs)
+    found: dict = dict.fromkeys(ERRORS)
+    if len(predicted):
+        found['n_mpjpe_mm'] = _number(_MM * metrics.n_mpjpe(predicted, truth).mean())
+        found['pa_mpjpe_mm'] = _number(_MM * metrics.pa_mpjpe(predicted, truth).mean())
+    if len(predicted) and all(lifted.units == 'm' for lifted, _ in pairs):
+        found['ne_flip_frame_percent'] = _number(100 * metrics.normalised_error_flip_frame(predicted, truth).mean())
+        found['ne_flip_global_percent'] = _number(100 * metrics.normalised_error_flip_global(predicted, truth).mean())
+        true_root = truth[:, root].mean(1)
+        missed = np.linalg.norm(predicted[:, root].mean(1) - true_root, axis=1)
+        found['root_error_median_mm'] = _number(_MM * np.median(missed))
+        found['root_error_median_percent'] = _number(100 * np.median(missed / np.linalg.norm(true_root, axis=1)))
+    return {'persons_with_truth': len(predicted), **found}
+
+
+def matched(pairs: list[tuple[Lifted, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Predictions and truths (M,P,3) of all persons that were lifted and whose truth is whole."""
+    predicted, truths = [], []
+    for lifted, truth in pairs:
+        if len(truth) == len(lifted.points):
+            both = lifted.ok & np.isfinite(truth).all(axis=(1, 2))
+            predicted.append(lifted.points[both])
+            truths.append(truth[both])
+    if not predicted:
+        return np.zeros((0, 1, 3)), np.zeros((0, 1, 3))
+    return np.concatenate(predicted), np.concatenate(truths)
+
+
+def versions() -> dict[str, str | None]:
+    """Of what the figures depend on."""
+    found: dict[str, str | None] = {'paul_ros': __version__, 'python': platform.python_version()}
+    for package in ('numpy', 'mcap', 'rosbags'):
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def _median(parts: list[np.ndarray]) -> float | None:
+    return _number(np.median(np.concatenate(parts))) if any(map(len, parts)) else None
+
+
+def _mean(parts: list[np.ndarray]) -> float | None:
+    return _number(np.concatenate(parts).mean()) if any(map(len, parts)) else None
+
+
+def _number(value: float) -> float | None:
+    """A Python float for JSON, which knows no NaN."""
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Named keypoints: what the P points of an array are, how they hang together, how layouts map onto another.
+
+All shipped layouts name their points in one vocabulary, so a layout maps onto another by name alone. Points
+of two layouts that are only nearly the same place on the body have different names there.
+"""
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, fields
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+#: Fewest points that a mapping must fill: two would leave the pose of a rigid body open.
+MIN_MAPPED = 3
+
+_SHIPPED = resources.files("paul_ros") / "layouts"
+_MAX_BYTES = 1_000_000
+_MAX_POINTS = 20_000
+_KEYS = ("name", "description", "names", "edges", "left_right", "root", "derived", "handedness")
+
+
+class LayoutError(ValueError):
+    """A layout that does not exist, is not one, or does not fit another; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Handedness:
+    """A rule of anatomy that tells a shape from its mirror image; each field holds point indices.
+
+    With m(.) the mean of points, (m(left) - m(right)) x (m(above) - m(below)) points along m(front) -
+    m(behind) in any right-handed frame: left x up = forward, as in REP-103's body frame.
+    """
+
+    left: tuple[int, ...]
+    right: tuple[int, ...]
+    below: tuple[int, ...]
+    above: tuple[int, ...]
+    behind: tuple[int, ...]
+    front: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """P named keypoints in order.
+
+    names: P names. edges: bones, as pairs of point indices. left_right: pairs of (left, right) indices.
+    root: the indices whose mean is the root point. derived: name -> indices whose mean that point is.
+    handedness: rules of anatomy; may be empty. description: what it is and where its order comes from.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    edges: tuple[tuple[int, int], ...]
+    left_right: tuple[tuple[int, int], ...]
+    root: tuple[int, ...]
+    derived: dict[str, tuple[int, ...]]
+    handedness: tuple[Handedness, ...]
+    description: str = ""
+
+    @classmethod
+    def from_dict(cls, data: object) -> Layout:
+        """The layout that a YAML file or a model's header describes; the inverse of to_dict.
+
+        Raises LayoutError, naming the key at fault.
+        """
+        return _parse(data)
+
+    def to_dict(self) -> dict:
+        """Plain lists and names, for JSON or YAML."""
+        return {
+            "name": self.name,
+            "description": self.description,
+            "names": list(self.names),
+            "edges": [self._named(edge) for edge in self.edges],
+            "left_right": [self._named(pair) for pair in self.left_right],
+            "root": self._named(self.root),
+            "derived": {name: self._named(parts) for name, parts in self.derived.items()},
+            "handedness": [
+                {part: self._named(points) for part, points in vars(rule).items()} for rule in self.handedness
+            ],
+        }
+
+    @property
+    def mirror(self) -> np.ndarray:
+        """(P,) indices: points[mirror] has left and right swapped."""
+        order = np.arange(len(self.names))
+        for left, right in self.left_right:
+            order[[left, right]] = right, left
+        return order
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """P of 'left', 'right' or '' for a point of the middle."""
+        sides = [""] * len(self.names)
+        for left, right in self.left_right:
+            sides[left], sides[right] = "left", "right"
+        return tuple(sides)
+
+    def difference(self, other: Layout) -> str:
+        """How the points of another layout differ, in one clause; '' where both have the same in order."""
+        if self.names == other.names:
+            return ""
+        missing = [name for name in self.names if name not in other.names]
+        added = [name for name in other.names if name not in self.names]
+        if not missing and not added:
+            pairs = enumerate(zip(self.names, other.names))
+            place, (here, there) = next((place, pair) for place, pair in pairs if pair[0] != pair[1])
+            return f"same points in another order, first at index {place}: '{there}' for '{here}'"
+        changes = {"without": missing, "with": added}
+        clauses = [f"{change} {_listed(names)}" for change, names in changes.items() if names]
+        return f"{len(other.names)} points for {len(self.names)}, " + " and ".join(clauses)
+
+    def map_to(self, target: Layout) -> Mapping:
+        """How arrays in this layout become arrays in the target's: by name, derived points as means.
+
+        Raises LayoutError where fewer than MIN_MAPPED points of the target can be filled.
+        """
+        sources = self._sources(target)
+        filled = sum(bool(parts) for parts in sources)
+        if filled < MIN_MAPPED:
+            raise LayoutError(
+                f"layout '{self.name}' has {filled} of the {len(target.names)} points of '{target.name}', "
+                f"at least {MIN_MAPPED} are needed. Layouts that map onto '{target.name}': {_fitting(target)}"
+            )
+        return Mapping(self, target, sources)
+
+    def _sources(self, target: Layout) -> tuple[tuple[int, ...], ...]:
+        known = {**self.derived, **{name: (index,) for index, name in enumerate(self.names)}}
+        return tuple(known.get(name, ()) for name in target.names)
+
+    def _named(self, points: tuple[int, ...]) -> list[str]:
+        return [self.names[index] for index in points]
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """Arrays of one layout into another. sources: per target point the source indices whose mean it is."""
+
+    source: Layout
+    target: Layout
+    sources: tuple[tuple[int, ...], ...]
+
+    def __call__(
+        self, xy: np.ndarray, confidence: np.ndarray, visible: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """xy (N,P,2), confidence (N,P), visible (N,P) -> the same in the target's P points.
+
+        A point that the source lacks is hidden: xy NaN, confidence 0. A derived point is the mean of its
+        parts, visible only where all of them are. Raises ValueError where the arrays do not have the source's
+        points.
+        """
+        self._check(xy, confidence, visible)
+        if self.source.names == self.target.names:
+            return xy, confidence, visible
+        shape = len(xy), len(self.sources)
+        mapped = np.full((*shape, 2), np.nan), np.zeros(shape), np.zeros(shape, dtype=bool)
+        points, copied = self._copied
+        for out, array in zip(mapped, (xy, confidence, visible)):
+            out[:, points] = array[:, copied]
+        for point, parts in self._means:
+            mapped[0][:, point] = xy[:, parts].mean(1)
+            mapped[1][:, point] = confidence[:, parts].mean(1)
+            mapped[2][:, point] = visible[:, parts].all(1)
+        return mapped
+
+    @cached_property
+    def _copied(self) -> tuple[np.ndarray, np.ndarray]:
+        pairs = [(point, parts[0]) for point, parts in enumerate(self.sources) if len(parts) == 1]
+        points, copied = np.array(pairs, dtype=int).reshape(-1, 2).T
+        return points, copied
+
+    @cached_property
+    def _means(self) -> list[tuple[int, list[int]]]:
+        return [(point, list(parts)) for point, parts in enumerate(self.sources) if len(parts) > 1]
+
+    def _check(self, xy: np.ndarray, confidence: np.ndarray, visible: np.ndarray) -> None:
+        expected = len(xy), len(self.source.names)
+        if xy.shape != (*expected, 2) or confidence.shape != expected or visible.shape != expected:
+            raise ValueError(
+                f"layout '{self.source.name}' needs xy (N,{expected[1]},2), confidence and visible "
+                f"(N,{expected[1]}), got {xy.shape}, {confidence.shape}, {visible.shape}"
+            )
+
+
+def layout_names() -> tuple[str, ...]:
+    """The shipped layouts, sorted."""
+    return tuple(sorted(file.name[:-5] for file in _SHIPPED.iterdir() if file.name.endswith(".yaml")))
+
+
+def load_layout(name_or_path: str | Path) -> Layout:
+    """A shipped layout by name, or a user's own by the path of its YAML file.
+
+    Raises LayoutError: unknown name, unreadable or oversized file, or a file that describes no layout.
+    """
+    name = str(name_or_path)
+    if name in layout_names():
+        return Layout.from_dict(yaml.safe_load((_SHIPPED / f"{name}.yaml").read_bytes()))
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml") and len(path.parts) < 2:
+        raise LayoutError(_unknown(name))
+    try:
+        return Layout.from_dict(_read_yaml(path))
+    except LayoutError as error:
+        raise LayoutError(f"layout file {path}: {error}") from None
+
+
+def _unknown(name: str) -> str:
+    close = difflib.get_close_matches(name.lower(), layout_names(), n=1)
+    hint = f", did you mean '{close[0]}'?" if close else "."
+    known = ", ".join(layout_names())
+    return f"no layout '{name}'{hint} There are {known}; for one of your own give the path of its .yaml"
+
+
+def _read_yaml(path: Path) -> object:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise LayoutError(f"{path.stat().st_size} bytes; a layout has at most {_MAX_BYTES}")
+        return yaml.safe_load(path.read_bytes())
+    except OSError as error:
+        raise LayoutError(error.strerror or str(error)) from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, LayoutError):
+            raise
+        raise LayoutError(f"no YAML: {' '.join(str(error).split())[:200]}") from None
+
+
+def _fitting(target: Layout) -> str:
+    shipped = (load_layout(name) for name in layout_names())
+    names = [layout.name for layout in shipped if sum(map(bool, layout._sources(target))) >= MIN_MAPPED]
+    return ", ".join(names) or "none of the shipped ones; name its points as one of them does"
+
+
+def _parse(data: object) -> Layout:
+    data = _mapping(data, "a layout")
+    unknown = [str(key) for key in data if key not in _KEYS]
+    if unknown:
+        raise LayoutError(f"unknown key {_listed(unknown)}; the keys are {', '.join(_KEYS)}")
+    missing = [key for key in ("name", "names", "root") if key not in data]
+    if missing:
+        raise LayoutError(f"{_listed(missing)} missing")
+    names = _names(data["names"])
+    index = {name: place for place, name in enumerate(names)}
+    derived = {
+        _text(name, "a name in derived"): _points(parts, f"derived '{name}'", index)
+        for name, parts in _mapping(data.get("derived", {}), "derived").items()
+    }
+    clashes = [name for name in derived if name in index]
+    if clashes:
+        raise LayoutError(f"derived {_listed(clashes)} is among the names already")
+    return Layout(
+        name=_text(data["name"], "name"),
+        names=names,
+        edges=_pairs(data.get("edges", []), "edges", index),
+        left_right=_sides(data.get("left_right", []), index),
+        root=_root(data["root"], index, derived),
+        derived=derived,
+        handedness=tuple(_rule(rule, index) for rule in _list(data.get("handedness", []), "handedness")),
+        description=_text(data["description"], "description").strip() if data.get("description") else "",
+    )
+
+
+def _names(value: object) -> tuple[str, ...]:
+    names = tuple(_text(name, "a name in names") for name in _list(value, "names"))
+    if not MIN_MAPPED <= len(names) <= _MAX_POINTS:
+        raise LayoutError(f"names has {len(names)} points; from {MIN_MAPPED} to {_MAX_POINTS} can be lifted")
+    seen: set[str] = set()
+    twice = [name for name in names if name in seen or seen.add(name)]
+    if twice:
+        raise LayoutError(f"names has {_listed(twice)} more than once")
+    return names
+
+
+def _root(value: object, index: dict[str, int], derived: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
+    if isinstance(value, str) and value in derived:
+        return derived[value]
+    return _points([value] if isinstance(value, str) else value, "root", index)
+
+
+def _sides(value: object, index: dict[str, int]) -> tuple[tuple[int, int], ...]:
+    pairs = _pairs(value, "left_right", index)
+    used = [point for pair in pairs for point in pair]
+    if len(set(used)) < len(used):
+        raise LayoutError("left_right has a point in two pairs")
+    return pairs
+
+
+def _rule(value: object, index: dict[str, int]) -> Handedness:
+    rule = _mapping(value, "a rule in handedness")
+    parts = [field.name for field in fields(Handedness)]
+    if set(rule) != set(parts):
+        raise LayoutError(f"a rule in handedness has the keys {', '.join(parts)}, all of them and no other")
+    return Handedness(*(_points(rule[part], f"handedness {part}", index) for part in parts))
+
+
+def _pairs(value: object, where: str, index: dict[str, int]) -> tuple[tuple[int, int], ...]:
+    pairs = tuple(_points(pair, where, index) for pair in _list(value, where))
+    if any(len(pair) != 2 or pair[0] == pair[1] for pair in pairs):
+        raise LayoutError(f"{where} must be pairs of two different points")
+    return pairs
+
+
+def _points(value: object, where: str, index: dict[str, int]) -> tuple[int, ...]:
+    names = [_text(name, f"a point in {where}") for name in _list(value, where)]
+    unknown = [name for name in names if name not in index]
+    if unknown:
+        raise LayoutError(f"{where} names {_listed(unknown)}, not in names")
+    if not names:
+        raise LayoutError(f"{where} names no point")
+    return tuple(index[name] for name in names)
+
+
+def _mapping(value: object, where: str) -> dict:
+    if not isinstance(value, dict):
+        raise LayoutError(f"{where} must be a mapping, not {type(value).__name__}")
+    return value
+
+
+def _list(value: object, where: str) -> list:
+    if not isinstance(value, list):
+        raise LayoutError(f"{where} must be a list, not {type(value).__name__}")
+    return value
+
+
+def _text(value: object, where: str) -> str:
+    if not isinstance(value, str) or not value:
+        if isinstance(value, (bool, int, float)):  # what YAML makes of an unquoted `no` or `12`
+            raise LayoutError(f"{where} must be text, but YAML reads it as {value!r}: put it in quotes")
+        raise LayoutError(f"{where} must be text, not {'empty' if value == '' else type(value).__name__}")
+    return value
+
+
+def _listed(names: list[str]) -> str:
+    """The first few of some names, for a message."""
+    rest = len(names) - 5
+    return ", ".join(f"'{name[:40]}'" for name in names[:5]) + (f" and {rest} more" if rest > 0 else "")

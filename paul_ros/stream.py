@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one path from a 2D keypoint message to 3D messages; node and replay are thin shells over it.
+
+message -> adapter -> confidence threshold -> model's layout -> Lifter -> messages. Nothing a message holds
+may stop the stream: what cannot be used is dropped, counted by its reason and explained.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import msg_adapters
+from msg_adapters import Intrinsics, Keypoints2D, MessageError, WrongPointCount, outputs
+from paul_ros.lifter import Lifted, Lifter
+from paul_ros.skeleton import Layout, layout_names, load_layout
+
+#: Lift times kept for the median and the 99th percentile: the last half minute at 30 Hz.
+_TIMES_KEPT = 1000
+#: Bones are drawn this wide, as a share of the mean shape's largest extent.
+_BONE_WIDTH = 0.01
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One lifted message.
+
+    header: the input's own header; keypoints: its N persons in the model's layout, low confidences hidden;
+    lifted: their 3D; layout: the model's; bone_width in the units of the points.
+    """
+
+    header: object
+    keypoints: Keypoints2D
+    lifted: Lifted
+    layout: Layout
+    bone_width: float
+
+    def message(self, output: str, make):
+        """One output message by name, of OUTPUTS; persons that were not lifted are left out."""
+        return getattr(self, '_' + output)(make, self.lifted.ok)
+
+    def messages(self, make) -> dict:
+        """All output messages by name."""
+        return {output: self.message(output, make) for output in OUTPUTS}
+
+    def _poses(self, make, ok: np.ndarray):
+        return outputs.pose_array(make, self.header, self.lifted.points[ok])
+
+    def _keypoints3d(self, make, ok: np.ndarray):
+        # An id that is no number becomes its row of the input, so rows are numbered before any is left out.
+        ids = outputs.id_numbers(self.keypoints.ids)[ok]
+        return outputs.points_cloud(make, self.header, self.lifted.points[ok],
+                                    self.keypoints.confidence[ok], ids)
+
+    def _markers(self, make, ok: np.ndarray):
+        return outputs.skeleton_markers(make, self.header, self.lifted.points[ok],
+                                        self.keypoints.visible[ok], self.layout.edges, self.layout.sides,
+                                        self.bone_width)
+
+
+#: Output name -> type name of its message.
+OUTPUTS = {
+    'poses': 'geometry_msgs/msg/PoseArray',
+    'keypoints3d': 'sensor_msgs/msg/PointCloud2',
+    'markers': 'visualization_msgs/msg/MarkerArray',
+}
+
+
+class LiftStream:
+    """Lifts a stream of 2D keypoint messages, one message at a time and each for itself.
+
+    counts: frames, persons, lifted. drops: reason -> how many messages, or persons ('person_...').
+    notes: what was odd but used, as 'stamp_backwards'. explanations: reason -> what to do about the last one.
+    lift_us: the last lift times in microseconds, of frames with persons.
+    """
+
+    def __init__(self, lifter: Lifter, layout: Layout, min_confidence: float, max_persons: int) -> None:
+        """layout: of the messages; raises LayoutError where the model's layout cannot be had from it."""
+        self.lifter = lifter
+        self.layout = layout
+        self.min_confidence = min_confidence
+        self.max_persons = max_persons
+        self.intrinsics: Intrinsics | None = None
+        self.counts: Counter = Counter(frames=0, persons=0, lifted=0)
+        self.drops: Counter = Counter()
+        self.notes: Counter = Counter()
+        self.explanations: dict[str, str] = {}
+        self.lift_us: deque[float] = deque(maxlen=_TIMES_KEPT)
+        self._mapping = layout.map_to(lifter.model.layout)
+        self._last_stamp: int | None = None
+
+    @property
+    def units(self) -> str:
+        """'m' once the intrinsics are known and the model knows its size, else 'model'."""
+        metric = self.intrinsics is not None and self.lifter.model.metres_per_unit is not None
+        return 'm' if metric else 'model'
+
+    def camera_info(self, msg) -> None:
+        """Takes the intrinsics; of an unusable CameraInfo nothing is taken and the drop is counted."""
+        with self.guard():
+            self.intrinsics = msg_adapters.read_camera_info(msg)
+
+    def keypoints(self, type_name: str, msg) -> Frame | None:
+        """Lifts one message; None = dropped, counted and explained. Zero persons are a frame too."""
+        with self.guard():
+            return self._frame(msg.header, self._read(type_name, msg))
+        return None
+
+    @contextlib.contextmanager
+    def guard(self):
+        """The one place where what goes wrong with a message becomes a counted drop."""
+        try:
+            yield
+        except WrongPointCount as error:
+            self._drop(error.reason, f'{error}; {_layout_advice(error)}')
+        except MessageError as error:
+            self._drop(error.reason, str(error))
+        except Exception as error:
+            if not self.drops['internal_error']:
+                _log.exception('a message could not be lifted; this is a fault of paul_ros, please report it')
+            self._drop('internal_error', f'{type(error).__name__}: {error}')
+
+    def describe(self) -> dict:
+        """What the outputs mean, for ~/layout and the head of a report."""
+        model = self.lifter.model
+        return {
+            'layout': model.layout.name,
+            'keypoints': list(model.layout.names),
+            'edges': [list(edge) for edge in model.layout.edges],
+            'sides': list(model.layout.sides),
+            'input_layout': self.layout.name,
+            'units': self.units,
+            'frame': 'header.frame_id of the input, an optical frame (REP-103): x right, y down, z forward',
+            'scale_source': _scale_source(self.intrinsics, model.metres_per_unit),
+            'chirality': model.header.get('chirality'),
+            'model': model.name,
+            'model_sha256': model.sha256,
+            'metres_per_unit': model.metres_per_unit,
+        }
+
+    def _read(self, type_name: str, msg) -> Keypoints2D:
+        keypoints = msg_adapters.read(type_name, msg, len(self.layout.names))
+        if keypoints.persons > self.max_persons:
+            raise MessageError('too_many_persons', f'{keypoints.persons} persons in one message; if that is '
+                               f'right, raise the parameter `max_persons` above {self.max_persons}')
+        return self._in_model_layout(keypoints)
+
+    def _in_model_layout(self, keypoints: Keypoints2D) -> Keypoints2D:
+        sure = keypoints.visible & (keypoints.confidence >= self.min_confidence)
+        xy, confidence, visible = self._mapping(keypoints.xy, keypoints.confidence, sure)
+        return replace(keypoints, xy=xy, confidence=np.where(visible, confidence, 0.0), visible=visible)
+
+    def _frame(self, header, keypoints: Keypoints2D) -> Frame:
+        # Every frame is lifted for itself, so time may run backwards, as when a bag loops; it is only noted.
+        if self._last_stamp is not None and keypoints.stamp < self._last_stamp:
+            self.notes['stamp_backwards'] += 1
+        self._last_stamp = keypoints.stamp
+        lifted = self._lift(keypoints)
+        self.counts.update(frames=1, persons=keypoints.persons, lifted=int(lifted.ok.sum()))
+        for reason in filter(None, lifted.reason):
+            self._drop('person_' + reason, 'this person is left out of the outputs')
+        model = self.lifter.model
+        unit = model.metres_per_unit if lifted.units == 'm' else 1.0
+        width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
+        return Frame(header, keypoints, lifted, model.layout, width)
+
+    def _lift(self, keypoints: Keypoints2D) -> Lifted:
+        start = time.perf_counter_ns()
+        lifted = self.lifter.lift(keypoints.xy, keypoints.visible, self.intrinsics)
+        if keypoints.persons:
+            self.lift_us.append((time.perf_counter_ns() - start) / 1000)
+        return lifted
+
+    def _drop(self, reason: str, explanation: str) -> None:
+        self.drops[reason] += 1
+        self.explanations[reason] = explanation
+
+
+def _scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) -> str:
+    if metres_per_unit is None:
+        return 'none: the model does not know its size in metres'
+    if intrinsics is None:
+        return 'none: no usable CameraInfo has come'
+    return "the model's metres per unit; distance from the camera's focal length"
+
+
+@functools.cache
+def _layout_sizes() -> dict[str, int]:
+    return {name: len(load_layout(name).names) for name in layout_names()}
+
+
+def _layout_advice(error: WrongPointCount) -> str:
+    fitting = [name for name, points in _layout_sizes().items() if error.fits(points)]
+    if not fitting:
+        return 'no shipped layout has that many; set the parameter `layout` to the path of one of your own'
+    return f'set the parameter `layout` to the one your detector uses: {", ".join(fitting)}'

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model file: round trip, damage, versions, layouts."""
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from paul_ros.model import (Model, ModelError, load_model, model_names, normalise, save_model, to_unit_size,
+                            weight_shapes)
+from paul_ros.skeleton import load_layout
+
+LAYOUT = load_layout("coco17")
+
+
+def header(**changes):
+    base = {
+        "layout": LAYOUT.to_dict(), "bottleneck": 3,
+        "architecture": {"encoder": {"kind": "residual", "width": 8, "blocks": 1},
+                         "decoder": {"kind": "mlp", "hidden": [4, 6]}},
+        "normalisation": {}, "chirality": {"known": False, "source": "none"}, "metres_per_unit": 0.25, "training": {},
+    }
+    return {**base, **changes}
+
+
+def arrays(seed=0):
+    rng = np.random.default_rng(seed)
+    return {name: rng.standard_normal(shape).astype(np.float32)
+            for name, shape in weight_shapes(header(), len(LAYOUT.names)).items()}
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "model.npz"
+    save_model(path, header(), arrays())
+    return path
+
+
+def test_round_trip(saved):
+    model = load_model(saved)
+    assert model.layout == LAYOUT and model.metres_per_unit == 0.25 and model.name == "model"
+    for name, value in arrays().items():
+        np.testing.assert_array_equal(value, model.mean_shape if name == "mean_shape" else model.weights[name])
+
+
+def test_any_single_changed_byte_is_noticed(saved):
+    data = saved.read_bytes()
+    for place in np.random.default_rng(0).choice(len(data), 200, replace=False):
+        saved.write_bytes(data[:place] + bytes([data[place] ^ 0x40]) + data[place + 1:])
+        with pytest.raises(ModelError):
+            load_model(saved)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
+def test_a_truncated_file_is_refused(saved, share):
+    data = saved.read_bytes()
+    saved.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ModelError, match="model.npz"):
+        load_model(saved)
+
+
+def test_another_format_version_is_refused(tmp_path):
+    save_model(tmp_path / "old.npz", header(format=99), arrays())
+    with pytest.raises(ModelError, match="format version 99"):
+        load_model(tmp_path / "old.npz")
+
+
+@pytest.mark.parametrize("metres", [0.0, -1.0, float("nan"), "0.3"])
+def test_absurd_metres_are_not_saved(tmp_path, metres):
+    with pytest.raises(ModelError, match="metres_per_unit"):
+        save_model(tmp_path / "bad.npz", header(metres_per_unit=metres), arrays())
+    assert not list(tmp_path.iterdir())
+
+
+def test_weights_that_are_not_finite_are_not_saved(tmp_path):
+    broken = arrays()
+    broken["decoder.0.bias"][0] = np.nan
+    with pytest.raises(ModelError, match="decoder.0.bias"):
+        save_model(tmp_path / "bad.npz", header(), broken)
+
+
+def test_unknown_models_are_named_with_the_known_ones():
+    with pytest.raises(ModelError, match="did you mean 'human_coco17'"):
+        load_model("human_coco")
+    with pytest.raises(ModelError, match="shipped models"):
+        load_model("/nowhere/x.npz")
+
+
+def test_another_layout_is_refused_with_advice(saved):
+    with pytest.raises(ModelError, match="coco17.*body25.*paul train"):
+        load_model(saved).check_layout(load_layout("body25"))
+
+
+def test_shape_ignores_place_size_and_hidden_points(saved):
+    model = load_model(saved)
+    rng = np.random.default_rng(1)
+    W, visible = rng.standard_normal((4, 2, 17)), rng.random((4, 17)) < 0.7
+    moved = np.where(visible[:, None], 300 * W + 50, np.nan)
+    np.testing.assert_allclose(model.shape(W, visible), model.shape(moved, visible), atol=1e-3)
+
+
+def test_normalise():
+    rng = np.random.default_rng(2)
+    W, visible = rng.standard_normal((4, 2, 17)), rng.random((4, 17)) < 0.7
+    out = normalise(W, visible)
+    np.testing.assert_allclose(out.sum(2), 0, atol=1e-9)
+    np.testing.assert_allclose((out**2).sum((1, 2)) / visible.sum(1), 1)
+    assert (out[~np.broadcast_to(visible[:, None], out.shape)] == 0).all()
+
+
+def test_unit_size_is_the_mean_edge():
+    S = to_unit_size(np.random.default_rng(3).standard_normal((2, 3, 17)) * 9, LAYOUT)
+    start, end = np.array(LAYOUT.edges).T
+    np.testing.assert_allclose(np.linalg.norm(S[:, :, start] - S[:, :, end], axis=1).mean(1), 1)
+
+
+def test_rigid_model_always_answers_the_mean(saved):
+    model = load_model(saved)
+    np.testing.assert_array_equal(model.rigid().shape(np.zeros((2, 2, 17)), np.ones((2, 17), bool))[1], model.mean_shape)
+
+
+def test_shipped_human_model():
+    assert "human_coco17" in model_names()
+    model: Model = load_model()
+    assert model.layout.names == LAYOUT.names and model.header["chirality"]["known"]
+    assert 0.2 < model.metres_per_unit < 0.4
+    assert model.header["training"]["command"].startswith("paul train")
+    json.dumps(model.header)
+
+
+def test_forward_pass_equals_torch(saved):
+    """In a process of its own: torch must not enter the process of the runtime's tests."""
+    code = f"""
+import numpy as np, torch
+from paul_ros.model import load_model, normalise
+from training.networks import Paul
+model = load_model({str(saved)!r})
+a = model.header["architecture"]
+paul = Paul(model.layout, 3, a["decoder"]["hidden"], a["encoder"]["width"], a["encoder"]["blocks"])
+paul.load_state_dict({{k: torch.from_numpy(v) for k, v in model.weights.items()}}, strict=False)
+rng = np.random.default_rng(0)
+W, visible = rng.standard_normal((5, 2, 17)), rng.random((5, 17)) < 0.8
+x = torch.from_numpy(normalise(W, visible).astype(np.float32))
+with torch.no_grad():
+    S = paul.decoder(paul.encoder(x, torch.from_numpy(visible))).numpy()
+np.testing.assert_allclose(model.shape(W, visible), S, atol=1e-4)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

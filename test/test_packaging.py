@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One source tree serves pip, colcon and colcon --symlink-install: in each ROS finds what it starts."""
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import venv
+import xml.etree.ElementTree as ElementTree
+from configparser import ConfigParser
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import paul_ros
+import pytest
+import yaml
+from catkin_pkg.package import parse_package
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = "paul_ros"
+ROOMS = ("paul_ros", "msg_adapters", "training")
+#: Where this run's own packages are (rclpy, NumPy ...); the installs under test borrow them.
+LIBRARIES = sysconfig.get_paths()["purelib"]
+
+
+@dataclass(frozen=True)
+class Install:
+    """An install prefix, and the environment of a shell that has sourced it."""
+
+    prefix: Path
+    environment: dict[str, str]
+
+    def launcher(self, name: str) -> Path:
+        """What `ros2 run paul_ros NAME` would start: get_executable_path of ros2pkg.api, step by step."""
+        code = f"from ament_index_python import get_package_prefix; print(get_package_prefix('{PACKAGE}'))"
+        prefix = Path(self.run(sys.executable, "-c", code).strip())
+        assert prefix == self.prefix
+        files = [path for path in (prefix / "lib" / PACKAGE).iterdir() if os.access(path, os.X_OK)]
+        return next(path for path in files if path.name == name)
+
+    def run(self, *command: object) -> str:
+        answer = subprocess.run(
+            [str(part) for part in command],
+            env=self.environment, cwd=self.prefix, capture_output=True, text=True, timeout=120,
+        )
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+        return answer.stdout
+
+
+@pytest.fixture(scope="session")
+def source(tmp_path_factory) -> Path:
+    """A copy of what git has or would take, so that no build output of the working tree plays a part."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    ).stdout.split("\0")
+    tree = tmp_path_factory.mktemp("workspace") / "src" / PACKAGE
+    for name in filter(None, listed):
+        if (ROOT / name).is_file():
+            (tree / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, tree / name)
+    return tree
+
+
+def pip_install(source: Path, folder: Path) -> Install:
+    """Into a virtual environment of its own, which sees the libraries of this one."""
+    prefix = folder / "venv"
+    venv.create(prefix, symlinks=True, with_pip=True)
+    tree = shutil.copytree(source, folder / "source")
+    pip = [sys.executable, "-m", "pip"]
+    options = ["--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "wheel", *options, "--wheel-dir", folder, tree], check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    subprocess.run([prefix / "bin" / "pip", "install", *options, wheel], check=True, capture_output=True)
+    site = prefix / Path(LIBRARIES).relative_to(sys.prefix)
+    (site / "libraries.pth").write_text(LIBRARIES + "\n")
+    return Install(prefix, {**os.environ, "AMENT_PREFIX_PATH": str(prefix)})
+
+
+def colcon_build(source: Path, folder: Path, *options: str) -> Install:
+    """In a workspace, then sourced as a user does."""
+    bin_first = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    build = subprocess.run(
+        ["colcon", "--log-base", "log", "build", "--base-paths", source.parent, *options],
+        cwd=folder, env=bin_first, capture_output=True, text=True,
+    )
+    assert build.returncode == 0, build.stdout + build.stderr
+    sourced = subprocess.run(
+        ["bash", "-c", "source install/setup.bash && env -0"],
+        cwd=folder, env=bin_first, check=True, capture_output=True, text=True,
+    ).stdout
+    environment = dict(line.split("=", 1) for line in sourced.split("\0") if line)
+    return Install(folder / "install" / PACKAGE, environment)
+
+
+@pytest.fixture(scope="session", params=["pip", "colcon", "colcon --symlink-install"])
+def install(request, source, tmp_path_factory) -> Install:
+    tool, *options = request.param.split()
+    folder = tmp_path_factory.mktemp(tool)
+    return pip_install(source, folder) if tool == "pip" else colcon_build(source, folder, *options)
+
+
+@pytest.mark.parametrize("name, usage", [("lifter", "usage: lifter"), ("paul", "usage: paul")])
+def test_ros2_run_finds_the_launcher_and_it_answers(install: Install, name: str, usage: str) -> None:
+    assert usage in install.run(install.launcher(name), "--help")
+
+
+def test_the_launched_node_comes_up_and_ends_on_sigint(install: Install, model_file: Path) -> None:
+    node = subprocess.Popen(
+        [install.launcher("lifter"), "--ros-args", "-p", f"model:={model_file}"],
+        env=install.environment, cwd=install.prefix,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )
+    try:
+        seen = ""
+        while "ready" not in seen:
+            line = node.stdout.readline()
+            assert line, f"the node ended with {node.wait()}:\n{seen}"
+            seen += line
+        node.send_signal(signal.SIGINT)
+        rest, _ = node.communicate(timeout=30)
+        assert node.returncode == 0, seen + rest
+    finally:
+        node.kill()
+        node.wait()
+
+
+def test_the_installed_package_is_the_one_that_runs_and_has_its_files(install: Install) -> None:
+    code = """
+import importlib.resources, paul_ros, training, msg_adapters
+from paul_ros.skeleton import layout_names
+print(paul_ros.__file__, ' '.join(layout_names()), sep='\\n')
+print(*sorted(f.name for f in (importlib.resources.files('paul_ros') / 'models').iterdir()))
+"""
+    own_python = install.prefix / "bin" / "python3"
+    answer = install.run(own_python if own_python.exists() else "python3", "-c", code)
+    module, layouts, models = answer.splitlines()
+    assert Path(module) != Path(paul_ros.__file__) and LIBRARIES not in module
+    assert layouts.split() == sorted(path.stem for path in (ROOT / "paul_ros/layouts").glob("*.yaml"))
+    assert models.split() == sorted(path.name for path in (ROOT / "paul_ros/models").glob("*.npz"))
+    share = install.prefix / "share" / PACKAGE
+    assert (share / "package.xml").read_bytes() == (ROOT / "package.xml").read_bytes()
+    for folder in ("launch", "config"):
+        assert sorted(path.name for path in (share / folder).iterdir()) == sorted(os.listdir(ROOT / folder))
+    assert {path.name for path in (share / "bags").iterdir()} >= {"ACKNOWLEDGEMENT.md", "one_person.mcap"}
+
+
+def test_a_user_can_run_the_command_under_its_own_name(install: Install) -> None:
+    assert "usage: paul" in install.run(install.prefix / "bin" / "paul", "--help")
+
+
+def test_versions_agree() -> None:
+    package = parse_package(str(ROOT / "package.xml"))
+    assert package.version == paul_ros.__version__ == metadata.version(PACKAGE)
+
+
+def test_package_xml_is_valid_and_says_what_the_code_needs() -> None:
+    package = parse_package(str(ROOT / "package.xml"))
+    package.validate()
+    assert package.package_format == 3 and package.get_build_type() == "ament_python"
+    assert package.licenses == ["Apache-2.0"] and (ROOT / package.licenses[0].file).is_file()
+    needed = {dependency.name for dependency in package.exec_depends}
+    setup = ConfigParser()
+    setup.read(ROOT / "setup.cfg")
+    required = re.findall(r"^[\w-]+", setup["options"]["install_requires"], re.MULTILINE)
+    assert {f"python3-{name.lower().removeprefix('py')}" for name in required} <= needed
+    node = (ROOT / "paul_ros/node.py").read_text(encoding="utf-8")
+    assert set(re.findall(r"^from (\w+_msgs)\.msg", node, re.MULTILINE)) - {"rcl_interfaces"} <= needed
+
+
+def test_the_environment_runs_this_source() -> None:
+    """A test that starts `paul` or the node would else judge an older state of the code."""
+    def contents(folder: Path) -> dict[str, bytes]:
+        files = (path for room in ROOMS for path in (folder / room).rglob("*"))
+        wanted = (path for path in files if path.suffix in (".py", ".yaml", ".npz"))
+        return {str(path.relative_to(folder)): path.read_bytes() for path in wanted}
+
+    source, installed = contents(ROOT), contents(Path(LIBRARIES))
+    differ = [name for name in source.keys() | installed.keys() if source.get(name) != installed.get(name)]
+    assert not differ, f"the virtual environment has another state of {differ}: run `make setup`"
+
+
+def test_the_launch_file_names_what_there_is() -> None:
+    """launch and launch_ros are on no index: the file is read as XML, and its substitutions are checked."""
+    launch = ElementTree.parse(ROOT / "launch/lifter.launch.xml").getroot()
+    node = launch.find("node")
+    assert node.get("pkg") == PACKAGE
+    assert (ROOT / "lib" / PACKAGE / node.get("exec")).is_file()
+    arguments = {argument.get("name"): argument.get("default") for argument in launch.findall("arg")}
+    used = set(re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(launch, encoding="unicode")))
+    assert used == set(arguments)
+    parameters = ROOT / arguments["config"].removeprefix(f"$(find-pkg-share {PACKAGE})/")
+    assert yaml.safe_load(parameters.read_text())["/**"]["ros__parameters"]
+    node_source = (ROOT / "paul_ros/node.py").read_text(encoding="utf-8")
+    for remap in node.findall("remap"):
+        assert f"'{remap.get('from')}'" in node_source
+
+
+def test_launchers_are_executable_in_git() -> None:
+    listed = subprocess.run(
+        ["git", "ls-files", "--stage", "lib", ".ci"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout.splitlines()
+    modes = {line.split("\t")[1]: line.split()[0] for line in listed}
+    assert modes == {name: "100755" for name in (".ci/run", "lib/paul_ros/lifter", "lib/paul_ros/paul")}

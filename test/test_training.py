@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trainer: its solver and objective against their definitions, 2D only, resumable to the bit, and clear refusals."""
+import argparse
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from paul_ros.lifter import Lifter
+from paul_ros.model import load_model
+from paul_ros.onp import onp
+from paul_ros.skeleton import load_layout
+from training import cli, human_data
+from training.data import DataError, load_training_data
+from training.export import mean_shape, metres_per_unit
+from training.mocap import CMU31
+from training.networks import Paul
+from training.objective import bone_variation, handedness_violation, paul_terms
+from training.recipe import Recipe, RecipeError, recipe_names
+from training.solver import centre, solve_camera
+from training.trainer import Trainer, TrainingError
+
+COCO = load_layout("coco17")
+SMALL = ["--set", "steps=12", "--set", "width=16", "--set", "batch=8", "--set", "bottleneck=3", "--quiet", "--threads", "1"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def views(count=40, seed=0):
+    """2D views (F,2,17) in pixels and the 3D truth (F,3,17), of bodies that vary a little about the shipped mean."""
+    rng = np.random.default_rng(seed)
+    S = load_model().mean_shape + 0.1 * rng.standard_normal((count, 3, 17))
+    S = Rotation.random(count, random_state=seed).as_matrix() @ S
+    return (100 * S[:, :2] + 300).astype(np.float32), S.astype(np.float32)
+
+
+@pytest.fixture
+def data_file(tmp_path):
+    path = tmp_path / "views.npz"
+    W, S = views()
+    visible = np.random.default_rng(1).random((40, 17)) < 0.8
+    np.savez(path, W=W, visible=visible, S=S)
+    return path
+
+
+def train(*arguments):
+    parser = argparse.ArgumentParser()
+    cli.add_arguments(parser)
+    return cli.run(parser.parse_args([str(argument) for argument in arguments]))
+
+
+def problem(count=6, points=12, noise=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    S = torch.from_numpy(rng.standard_normal((count, 3, points)))
+    R = torch.from_numpy(Rotation.random(count, random_state=seed).as_matrix())
+    visible = torch.from_numpy(rng.permuted(np.tile(np.arange(points) < points - 2, (count, 1)), axis=1))
+    W = 1.7 * R[:, :2] @ S + noise * torch.from_numpy(rng.standard_normal((count, 2, points)))
+    return S, R, centre(W, visible), visible
+
+
+def test_solver_finds_the_camera_of_exact_views():
+    S, R, W, visible = problem()
+    found, scale = solve_camera(S, W, visible)
+    torch.testing.assert_close(found, R, atol=1e-6, rtol=0)
+    torch.testing.assert_close(scale.flatten(), torch.full((6,), 1.7, dtype=torch.double), rtol=1e-6, atol=0)
+    torch.testing.assert_close(torch.linalg.det(found), torch.ones(6, dtype=torch.double))
+
+
+def test_solver_ignores_hidden_points():
+    S, _, W, visible = problem(noise=0.1)
+    broken = torch.where(visible[:, None], W, 1e3)
+    torch.testing.assert_close(solve_camera(S, W, visible), solve_camera(S, broken, visible))
+
+
+def test_solver_reaches_the_certified_optimum():
+    S, _, W, visible = problem(count=200, noise=0.2)
+    _, scale = solve_camera(S, W, visible)
+    optimum = onp(S.numpy(), W.numpy(), visible.numpy())
+    agrees = np.isclose(scale.flatten().numpy(), optimum.scale, rtol=1e-5)
+    assert agrees.mean() > 0.95  # the rest: another local optimum
+
+
+def test_solver_gradient_against_finite_differences():
+    S, _, W, visible = problem(count=2, noise=0.2)
+    assert torch.autograd.gradcheck(lambda s: solve_camera(s, W, visible), S.clone().requires_grad_(), atol=1e-6)
+
+
+def test_solver_gradient_is_finite_for_flat_shapes():
+    S, _, W, visible = problem()
+    S = (S * torch.tensor([1.0, 1.0, 0.0])[:, None]).requires_grad_()
+    R, scale = solve_camera(S, W, visible)
+    (R.sum() + scale.sum()).backward()
+    assert torch.isfinite(S.grad).all()
+
+
+def test_objective_does_not_see_hidden_points():
+    torch.manual_seed(0)
+    networks = Paul(COCO, 4, [8, 16], 16, 1)
+    W = torch.from_numpy(views(8)[0]) / 100
+    visible = torch.from_numpy(np.random.default_rng(0).random((8, 17)) < 0.7)
+    W = centre(W, visible) * visible[:, None]
+    terms = paul_terms(networks, COCO, W, visible)
+    again = paul_terms(networks, COCO, torch.where(visible[:, None], W, 0.0), visible)
+    assert terms.recon_ad == again.recon_ad
+    shifted = W.clone()
+    shifted[:, :, 3] += 0.5
+    assert paul_terms(networks, COCO, shifted * visible[:, None], visible).recon_ad != terms.recon_ad
+
+
+def test_handedness_tells_a_body_from_its_mirror_image():
+    S = torch.from_numpy(load_model().mean_shape)[None]
+    mirrored = S * torch.tensor([1.0, 1.0, -1.0])[:, None]
+    assert handedness_violation(S, COCO) == 0
+    assert handedness_violation(mirrored, COCO) > 0.5
+
+
+def test_bone_variation_is_zero_for_one_body_in_any_orientation():
+    S = torch.from_numpy(load_model().mean_shape).double()
+    turned = torch.from_numpy(Rotation.random(5, random_state=0).as_matrix()) @ S
+    assert bone_variation(turned, COCO) < 1e-10
+    assert bone_variation(turned * torch.linspace(1, 2, 5)[:, None, None], COCO) > 0.01
+
+
+def test_only_2d_reaches_the_trainer(data_file, tmp_path, monkeypatch):
+    """Twice: no other array of the file is opened, and without the truth the weights are the same to the bit."""
+    opened = []
+    original = np.lib.npyio.NpzFile.__getitem__
+    monkeypatch.setattr(np.lib.npyio.NpzFile, "__getitem__", lambda self, key: opened.append(key) or original(self, key))
+    train(data_file, "-o", tmp_path / "with.npz", *SMALL)
+    assert set(opened) == {"W", "visible"}
+    with np.load(data_file) as archive:
+        np.savez(tmp_path / "views2d.npz", W=archive["W"], visible=archive["visible"])
+    train(tmp_path / "views2d.npz", "-o", tmp_path / "without.npz", *SMALL)
+    with_truth, without = load_model(tmp_path / "with.npz"), load_model(tmp_path / "without.npz")
+    for name, value in with_truth.weights.items():
+        np.testing.assert_array_equal(value, without.weights[name])
+
+
+def test_interrupted_and_continued_equals_uninterrupted(data_file, tmp_path):
+    data = load_training_data(data_file, COCO)
+    recipe = Recipe.from_dict({"steps": 10, "width": 16, "batch": 8, "hide": 0.3, "mirror_object": True})
+    whole = Trainer(data, recipe, tmp_path / "whole")
+    for _ in whole.run():
+        pass
+    first = Trainer(data, recipe, tmp_path / "parts")
+    for row in first.run():
+        if row["step"] == 4:
+            break
+    second = Trainer(data, recipe, tmp_path / "parts")
+    assert second.resume() and second.step == 4
+    for _ in second.run():
+        pass
+    for a, b in zip(whole.networks.parameters(), second.networks.parameters()):
+        assert torch.equal(a, b)
+
+
+def test_another_seed_gives_other_weights(data_file, tmp_path):
+    for seed in (0, 1):
+        train(data_file, "-o", tmp_path / f"{seed}.npz", *SMALL, "--set", f"seed={seed}")
+    a, b = (load_model(tmp_path / f"{seed}.npz").weights["decoder.0.weight"] for seed in (0, 1))
+    assert not np.array_equal(a, b)
+
+
+def test_log_model_and_json(data_file, tmp_path):
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--json", tmp_path / "m.json")
+    with open(tmp_path / "m.run" / "log.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert int(rows[-1]["step"]) == 12 and np.isfinite(float(rows[-1]["loss"]))
+    header = json.loads((tmp_path / "m.json").read_text())
+    assert header["training"]["steps"] == 12 and header["metres_per_unit"] is None
+    assert header == {key: value for key, value in load_model(tmp_path / "m.npz").header.items() if key != "format"}
+
+
+def test_training_lowers_the_loss_and_lifts(data_file, tmp_path):
+    data = load_training_data(data_file, COCO)
+    trainer = Trainer(data, Recipe.from_dict({"steps": 150, "width": 32, "batch": 32}), tmp_path)
+    losses = [row["recon_ad"] for row in trainer.run()]
+    assert np.mean(losses[-20:]) < 0.7 * np.mean(losses[:20])
+
+
+def test_a_run_of_other_data_or_recipe_is_not_continued(data_file, tmp_path):
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL)
+    with pytest.raises(TrainingError, match="another recipe.*--fresh"):
+        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", "seed=5")
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", "seed=5", "--fresh")
+
+
+def test_a_damaged_checkpoint_is_named(data_file, tmp_path):
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL)
+    (tmp_path / "m.run" / "checkpoint.pt").write_bytes(b"junk")
+    with pytest.raises(TrainingError, match="--fresh"):
+        train(data_file, "-o", tmp_path / "m.npz", *SMALL)
+
+
+BAD_ARRAYS = {
+    "no W": (dict(X=np.zeros(3)), "no array W"),
+    "wrong points": (dict(W=np.zeros((5, 2, 16))), "--layout"),
+    "3D given as 2D": (dict(W=np.zeros((5, 3, 17))), "--layout"),
+    "text": (dict(W=np.full((5, 2, 17), "a")), "numbers"),
+    "mask of another size": (dict(W=np.ones((5, 2, 17)), visible=np.ones((4, 17), bool)), "visible"),
+    "all hidden": (dict(W=np.random.rand(5, 2, 17), visible=np.zeros((5, 17), bool)), "nothing to train on"),
+    "all NaN": (dict(W=np.full((5, 2, 17), np.nan)), "nothing to train on"),
+    "all at one place": (dict(W=np.full((5, 2, 17), 3.0)), "nothing to train on"),
+    "huge": (dict(W=np.full((5, 2, 17), 1e30)), "no pixels"),
+    "pickled": (dict(W=np.array([{}, {}], dtype=object)), "plain arrays"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ARRAYS)
+def test_bad_data_is_refused_before_the_first_step(tmp_path, case):
+    contents, message = BAD_ARRAYS[case]
+    np.savez(tmp_path / "bad.npz", **contents)
+    with pytest.raises(DataError, match=message):
+        load_training_data(tmp_path / "bad.npz", COCO)
+
+
+def test_frames_with_too_few_points_are_left_out_and_counted(tmp_path):
+    W, _ = views(10)
+    W[3] = np.nan
+    np.savez(tmp_path / "some.npz", W=W)
+    data = load_training_data(tmp_path / "some.npz", COCO)
+    assert len(data.W) == 9 and data.left_out == 1
+
+
+@pytest.mark.parametrize("override,message", [("steps=many", "steps"), ("nonsense=1", "unknown"), ("batch", "key=value"),
+                                              ("width=-4", "positive"), ("hide=1.0", "hide")])
+def test_bad_recipes_are_refused(override, message):
+    with pytest.raises(RecipeError, match=message):
+        Recipe.load("default", [override])
+
+
+def test_shipped_recipes_load():
+    assert {"default", "human"} <= set(recipe_names())
+    for name in recipe_names():
+        assert Recipe.from_dict(Recipe.load(name).to_dict()) == Recipe.load(name)
+
+
+def test_known_lengths_set_the_metres():
+    shapes = np.zeros((4, 3, 17))
+    shapes[:, 1, 13] = 2.0  # left knee two units from the left hip
+    assert metres_per_unit(shapes, COCO, (("left_hip", "left_knee", 0.5),)) == 0.25
+    assert metres_per_unit(shapes, COCO, ()) is None
+
+
+def test_mean_shape_forgets_orientation():
+    shape = np.random.default_rng(0).standard_normal((3, 17))
+    shape -= shape.mean(1, keepdims=True)
+    turned = Rotation.random(30, random_state=0).as_matrix() @ shape
+    lengths = [np.linalg.norm(s[:, :, None] - s[:, None], axis=0) for s in (mean_shape(turned), shape)]
+    np.testing.assert_allclose(*lengths, atol=1e-9)
+
+
+# --- human_data: what the trainer of the shipped model is fed
+
+
+def clip(seed, frames=60):
+    """A made-up moving CMU-31 skeleton (F,31,3)."""
+    rng = np.random.default_rng(seed)
+    base, sway = rng.standard_normal((31, 3)), rng.standard_normal((31, 3))
+    return base + 0.3 * np.sin(np.linspace(0, 6, frames))[:, None, None] * sway
+
+
+def test_no_held_out_frame_trains_under_any_name():
+    turned = 2 * clip(1) @ Rotation.random(random_state=0).as_matrix().T + 5
+    clips = [("02_01", clip(1)), ("05_18", clip(2)), ("05_01", clip(3)), ("walking_1", turned), ("walking_2", clip(4))]
+    assert [name for name, _ in human_data.training_clips(clips)] == ["05_01", "walking_2"]
+
+
+def test_views_are_what_a_camera_would_see():
+    rng = np.random.default_rng(0)
+    points = np.tile(rng.standard_normal((17, 3)) * 0.3, (50, 1, 1))
+    W, visible, S = human_data.see(points, human_data.Views(noise=0, outlier_noise=0, swap_share=0), rng)
+    lengths = np.linalg.norm(S[:, :, 0] - S[:, :, 9], axis=1)
+    np.testing.assert_allclose(lengths, np.linalg.norm(points[0, 0] - points[0, 9]), rtol=1e-5)
+    depth = S[:, 2].astype(float)
+    distance = S[:, 0, 5] / W[:, 0, 5] - depth[:, 5]
+    np.testing.assert_allclose(W, S[:, :2] / (depth + distance[:, None])[:, None], rtol=1e-3, atol=1e-5)
+    assert ((distance > 1.9) & (distance < 8.1)).all()
+    assert 0.6 < visible.mean() < 0.9
+
+
+def test_cameras_keep_people_upright():
+    R, _ = human_data.random_cameras(500, human_data.Views(), np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.det(R), 1)
+    assert (R[:, 1, 1] < 0).all()  # world up is image up: y down in the image
+    assert len(CMU31) == 31

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``paul train``: 2D keypoints in, a model file out."""
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from paul_ros.model import ModelError, write_atomically
+from paul_ros.skeleton import LayoutError, load_layout
+from training.data import DataError, load_training_data
+from training.export import export_model
+from training.recipe import Recipe, RecipeError, recipe_names
+from training.trainer import Trainer, TrainingError, use_threads
+
+ERRORS = (DataError, RecipeError, TrainingError, ModelError, LayoutError)
+"""What a user can cause and mend; the text of each is one clear line."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's options."""
+    parser.add_argument("data", metavar="DATA", help="npz with W (F,2,P) and optional visible (F,P), or a bag of 2D keypoints")
+    parser.add_argument("-o", "--output", metavar="MODEL", required=True, type=Path, help="model file to write (.npz)")
+    parser.add_argument("--layout", default="coco17", help="layout of the points: a shipped name or a YAML file (default: %(default)s)")
+    parser.add_argument("--topic", help="topic of a bag, where it has several with 2D keypoints")
+    parser.add_argument("--recipe", default="default",
+                        help=f"one of {', '.join(recipe_names())}, or a YAML file (default: %(default)s)")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe")
+    parser.add_argument("--fresh", action="store_true", help="start over instead of continuing the run beside MODEL")
+    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, or continue, and export. Raises one of ERRORS."""
+    if args.output.suffix != ".npz":
+        raise DataError(f"the model file must end in .npz, not '{args.output.name}'")
+    recipe = Recipe.load(args.recipe, args.set)
+    data = load_training_data(args.data, load_layout(args.layout), args.topic)
+    folder = args.output.with_suffix(".run")
+    if args.fresh:
+        shutil.rmtree(folder, ignore_errors=True)
+    use_threads(args.threads)
+    trainer = Trainer(data, recipe, folder)
+    resumed = trainer.resume()
+    left_out = f", {data.left_out} left out (too few points)" if data.left_out else ""
+    print(f"{len(data.W)} frames of layout {data.layout.name} from {data.source}{left_out}"
+          + (f"; continuing at step {trainer.step}" if resumed else ""), file=sys.stderr)
+    try:
+        _watch(trainer, args.quiet)
+    except KeyboardInterrupt:
+        raise TrainingError(f"stopped at step {trainer.step} of {recipe.steps}: the same command continues") from None
+    header = export_model(trainer, args.output, _command())
+    _report(header, args)
+    return 0
+
+
+def _watch(trainer: Trainer, quiet: bool) -> None:
+    with tqdm(total=trainer.recipe.steps, initial=trainer.step, unit="step", disable=quiet, dynamic_ncols=True) as bar:
+        for row in trainer.run():
+            bar.update()
+            if row["step"] % 20 == 0:
+                bar.set_postfix(loss=f"{row['loss']:.4f}", ae=f"{row['recon_ae']:.4f}", ad=f"{row['recon_ad']:.4f}")
+
+
+def _command() -> str:
+    return " ".join(["paul", *sys.argv[1:]])
+
+
+def _report(header: dict, args: argparse.Namespace) -> None:
+    training, metres = header["training"], header["metres_per_unit"]
+    print(f"{args.output}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
+          f"reconstruction loss {training['final']['recon_ad']:.4f}\n"
+          f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}\n"
+          f"  chirality: {'known' if header['chirality']['known'] else 'UNKNOWN'}, {header['chirality']['source']}")
+    if args.json:
+        write_atomically(args.json, json.dumps(header, indent=1).encode())

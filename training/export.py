@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a finished run to the model file that the robot loads."""
+from __future__ import annotations
+
+import platform
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import paul_ros
+from paul_ros.metrics import procrustes
+from paul_ros.model import save_model
+from paul_ros.skeleton import Layout
+from training.trainer import Trainer, predict_shapes, rule_share
+
+_MEAN_ROUNDS = 10
+
+
+def export_model(trainer: Trainer, path: Path, command: str) -> dict:
+    """Write encoder, decoder and mean shape; returns the header.
+
+    Raises:
+        ModelError: the weights do not make a model (NaN, say).
+    """
+    shapes = predict_shapes(trainer.networks, trainer.data)
+    layout, recipe = trainer.data.layout, trainer.recipe
+    header = {
+        "layout": layout.to_dict(),
+        "bottleneck": recipe.bottleneck,
+        "architecture": {
+            "encoder": {"kind": "residual", "width": recipe.width, "blocks": recipe.blocks},
+            "decoder": {"kind": "mlp", "hidden": list(recipe.hidden)},
+        },
+        "normalisation": {
+            "input": "centred on the mean of the visible points, root mean square distance 1",
+            "unit": "mean edge length" if layout.edges else "root mean square distance to the centre",
+        },
+        "chirality": _chirality(shapes, layout, recipe.handedness_weight),
+        "metres_per_unit": metres_per_unit(shapes, layout, recipe.known_lengths),
+        "training": {
+            "data": trainer.data.source, "data_sha256": trainer.data.sha256, "frames": len(trainer.data.W),
+            "command": command, "recipe": recipe.to_dict(), "steps": trainer.step,
+            "seconds": round(trainer.seconds, 1), "final": dict(zip(("loss", "recon_ae", "recon_ad"), _final(trainer))),
+            "versions": {"paul_ros": paul_ros.__version__, "torch": torch.__version__.split("+")[0],
+                         "python": platform.python_version()},
+        },
+    }
+    save_model(path, header, {**_weights(trainer), "mean_shape": mean_shape(shapes)})
+    return header
+
+
+def _weights(trainer: Trainer) -> dict[str, np.ndarray]:
+    """What runs on the robot: h and f_d, under the names that ``paul_ros.model`` gives them."""
+    return {name: value.numpy() for name, value in trainer.networks.state_dict().items()
+            if not name.startswith("shape_encoder.")}
+
+
+def _final(trainer: Trainer) -> tuple[float, ...]:
+    """Mean of the last logged losses."""
+    last = np.array([row[2:5] for row in trainer.rows[-10:]])
+    return tuple(round(float(value), 5) for value in last.mean(0))
+
+
+def _chirality(shapes: np.ndarray, layout: Layout, weight: float) -> dict:
+    """Which of the two mirror images the model's shapes are, and how that is known."""
+    share = rule_share(shapes, layout)
+    if share is None:
+        return {"known": False, "source": "orthographic views alone leave the mirror image open; "
+                                          "give the layout a handedness rule to settle it"}
+    return {"known": share > 0.5, "source": f"handedness rule of layout '{layout.name}', training weight {weight:g}",
+            "training_share": round(share, 4)}
+
+
+def mean_shape(shapes: np.ndarray) -> np.ndarray:
+    """Generalised Procrustes mean (3,P) of canonical shapes (F,3,P): rotations only, sizes as they are."""
+    points = shapes.transpose(0, 2, 1)
+    mean = points[0]
+    for _ in range(_MEAN_ROUNDS):
+        R, _ = procrustes(points, np.broadcast_to(mean, points.shape))
+        mean = np.einsum("nij,npj->pi", R, points) / len(points)
+    return mean.T
+
+
+def metres_per_unit(shapes: np.ndarray, layout: Layout, known_lengths: tuple) -> float | None:
+    """Metres per model unit from lengths known in advance: their sum over the sum of their median model lengths.
+
+    Raises:
+        KeyError: a name that is no point of the layout.
+    """
+    if not known_lengths:
+        return None
+    index = {name: i for i, name in enumerate(layout.names)}
+    model = [np.median(np.linalg.norm(shapes[:, :, index[a]] - shapes[:, :, index[b]], axis=1))
+             for a, b, _ in known_lengths]
+    return float(sum(metres for _, _, metres in known_lengths) / sum(model))

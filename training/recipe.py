@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recipe: every setting of a training run, in one YAML file."""
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import yaml
+
+
+class RecipeError(ValueError):
+    """A recipe that cannot be used; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Settings of a run. Where a default departs from the paper's, the comment says so."""
+
+    bottleneck: int = 8  # K; the paper: 4 for small or rigid objects, 8 for articulated ones
+    hidden: tuple[int, ...] = (16, 32, 64, 128, 256)  # f_d from the code upwards; f_e is its reverse
+    width: int = 256  # of the 2D encoder's residual blocks
+    blocks: int = 2
+    steps: int = 20_000
+    batch: int = 256
+    learning_rate: float = 1e-3  # Adam, warmed up over 200 steps, then a cosine to zero
+    seed: int = 0
+    code_weight: float = 1e-3  # the paper: 0.01
+    decay_weight: float = 0.0  # of |theta_d|^2; the paper: 1e-4
+    handedness_weight: float = 1.0  # beyond the paper: keeps frames from settling on mirrored shapes
+    bone_weight: float = 1.0  # beyond the paper: edges of the layout keep their lengths
+    roll: float = 0.3  # radians; in-plane turns of W, an exact augmentation under an orthographic camera
+    mirror_view: bool = True  # x-mirrored W is the same shape seen from behind: exact too
+    mirror_object: bool = False  # left and right exchanged: only for objects that are symmetric
+    hide: float = 0.0  # up to this share of a frame's points is hidden anew at every step
+    known_lengths: tuple[tuple[str, str, float], ...] = ()  # (point, point, metres): sets the metres per model unit
+
+    @classmethod
+    def load(cls, name_or_path: str | Path, overrides: list[str] = ()) -> Recipe:
+        """Read a shipped recipe by name or any YAML file, then apply ``key=value`` overrides.
+
+        Raises:
+            RecipeError: unknown file, key or value.
+        """
+        settings = _read(name_or_path)
+        for override in overrides:
+            key, equals, value = override.partition("=")
+            if not equals:
+                raise RecipeError(f"'{override}' is no override: write key=value")
+            settings[key.strip()] = yaml.safe_load(value)
+        return cls.from_dict(settings)
+
+    @classmethod
+    def from_dict(cls, settings: dict) -> Recipe:
+        """Check and build; raises RecipeError."""
+        fields = {field.name: field for field in dataclasses.fields(cls)}
+        unknown = sorted(set(settings) - set(fields))
+        if unknown:
+            raise RecipeError(f"unknown recipe setting {', '.join(unknown)}; known are {', '.join(fields)}")
+        return cls(**{key: _converted(key, value, fields[key].default) for key, value in settings.items()})
+
+    def __post_init__(self) -> None:
+        for name in ("bottleneck", "width", "blocks", "steps", "batch", "learning_rate"):
+            if getattr(self, name) <= 0:
+                raise RecipeError(f"recipe setting {name} must be positive, it is {getattr(self, name)}")
+        if not 0 <= self.hide < 1:
+            raise RecipeError(f"recipe setting hide must be in [0, 1), it is {self.hide}")
+
+    def to_dict(self) -> dict:
+        """Plain lists and numbers, for YAML and the model's header."""
+        return {key: [list(item) if isinstance(item, tuple) else item for item in value] if isinstance(value, tuple)
+                else value for key, value in dataclasses.asdict(self).items()}
+
+
+def recipe_names() -> list[str]:
+    """Names of the shipped recipes."""
+    folder = resources.files("training") / "recipes"
+    return sorted(item.name[:-5] for item in folder.iterdir() if item.name.endswith(".yaml"))
+
+
+def _read(name_or_path: str | Path) -> dict:
+    text = str(name_or_path)
+    path = resources.files("training") / "recipes" / f"{text}.yaml" if text in recipe_names() else Path(text)
+    if not path.is_file():
+        raise RecipeError(f"no recipe '{text}': neither a file nor one of {', '.join(recipe_names())}")
+    try:
+        settings = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise RecipeError(f"recipe '{text}' is no YAML: {error}") from error
+    if settings is not None and not isinstance(settings, dict):
+        raise RecipeError(f"recipe '{text}' must be settings as key: value")
+    return settings or {}
+
+
+def _converted(key: str, value: object, default: object) -> object:
+    """The value in the default's type; lists become tuples."""
+    if isinstance(default, tuple) and isinstance(value, (list, tuple)):
+        return tuple(tuple(item) if isinstance(item, list) else item for item in value)
+    if isinstance(default, bool) and isinstance(value, bool):
+        return value
+    if type(default) in (int, float) and type(value) in (int, float):
+        if type(default) is float or float(value).is_integer():
+            return type(default)(value)
+    # YAML 1.1 reads 1e-3 as text.
+    if isinstance(default, float) and isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    raise RecipeError(f"recipe setting {key} must be like {default!r}, it is {value!r}")
