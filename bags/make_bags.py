@@ -6,6 +6,7 @@
 
 World: metres, y up, the camera above the origin, looking along +z and a little down; to its right is -x.
 """
+
 from __future__ import annotations
 
 import math
@@ -23,11 +24,11 @@ from msg_adapters.outputs import keypoints_cloud, pose_array  # noqa: E402
 from paul_ros.bag import BagMessages, BagWriter  # noqa: E402
 from training.mocap import coco17_from_cmu31  # noqa: E402
 
-RATE = 30                                # Hz
-START = 1_750_000_000 * 1_000_000_000    # ns; any time will do
-FRAME_ID = 'camera_color_optical_frame'
+RATE = 30  # Hz
+START = 1_750_000_000 * 1_000_000_000  # ns; any time will do
+FRAME_ID = "camera_color_optical_frame"
 LEFT_ARM, RIGHT_ARM, LEFT_LEG, RIGHT_LEG = (5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16)
-MIN_POINTS_SEEN = 4                      # a detector finds no person in fewer
+MIN_POINTS_SEEN = 4  # a detector finds no person in fewer
 
 
 @dataclass(frozen=True)
@@ -68,16 +69,17 @@ class Person:
     pivot: tuple[float, float]
     place: tuple[float, float]
     first_frame: int = 0  # frame of the bag at which the clip begins
-    floor: float = 0.0    # metres by which the clip is lowered
+    floor: float = 0.0  # metres by which the clip is lowered
 
     def points(self) -> np.ndarray:
         """COCO-17 in the world, (F,17,3) metres."""
-        with np.load(HERE / 'source' / f'{self.clip}.npz', allow_pickle=False) as file:
-            points = coco17_from_cmu31(file['joints'])
+        with np.load(HERE / "source" / f"{self.clip}.npz", allow_pickle=False) as file:
+            points = coco17_from_cmu31(file["joints"])
         sin, cos = math.sin(math.radians(self.yaw_deg)), math.cos(math.radians(self.yaw_deg))
         x, z = points[..., 0] - self.pivot[0], points[..., 2] - self.pivot[1]
-        return np.stack([cos * x + sin * z + self.place[0], points[..., 1] - self.floor,
-                         cos * z - sin * x + self.place[1]], axis=-1)
+        return np.stack(
+            [cos * x + sin * z + self.place[0], points[..., 1] - self.floor, cos * z - sin * x + self.place[1]], axis=-1
+        )
 
 
 @dataclass(frozen=True)
@@ -86,14 +88,14 @@ class Seen:
 
     ident: int
     truth: np.ndarray
-    xy: np.ndarray          # (17,2), NaN where hidden
+    xy: np.ndarray  # (17,2), NaN where hidden
     confidence: np.ndarray  # (17,), 0 where hidden
 
 
 def one_person() -> tuple[Camera, list[list[Seen]]]:
-    """Bends, scoops, rises and lifts the arms, 4 m away; every point seen, no noise."""
+    """Climbs, swings, jumps, sits and walks, about 4.6 m away; every point seen, no noise."""
     camera = Camera()
-    person = Person(1, '02_06', yaw_deg=-150.0, pivot=(0.5, 0.0), place=(0.0, 4.0))
+    person = Person(1, "01_14", yaw_deg=60.0, pivot=(0.4, 0.85), place=(0.0, 4.6))
     frames = camera.see(person.points())
     return camera, [[Seen(person.ident, truth, camera.project(truth), np.ones(17))] for truth in frames]
 
@@ -102,8 +104,8 @@ def two_persons() -> tuple[Camera, list[list[Seen]]]:
     """Two walkers who cross; occlusion, image border, dropouts and detector noise hide and move points."""
     camera = Camera()
     persons = [
-        Person(3, '03_04', yaw_deg=90.0, pivot=(0.3, 1.8), place=(2.8, 3.6), first_frame=10, floor=0.2),
-        Person(7, '29_01', yaw_deg=147.0, pivot=(0.97, -0.79), place=(-2.4, 2.9), first_frame=10),
+        Person(3, "03_04", yaw_deg=90.0, pivot=(0.3, 1.8), place=(2.8, 3.6), first_frame=10, floor=0.2),
+        Person(7, "29_01", yaw_deg=147.0, pivot=(0.97, -0.79), place=(-2.4, 2.9), first_frame=10),
     ]
     frames = _on_one_clock(camera, persons, seconds=13.0)
     rng = np.random.default_rng(20260101)
@@ -132,8 +134,14 @@ def _detect(camera: Camera, truths: list[tuple[int, np.ndarray]], rng: np.random
         noise = rng.normal(size=(17, 2)) * rng.uniform(2.0, 3.0, size=(17, 1))
         confidence = np.clip(0.95 - 0.03 * np.hypot(*noise.T) - 0.1 * rng.random(17), 0.3, 1.0)
         if (~hidden).sum() >= MIN_POINTS_SEEN:
-            found.append(Seen(ident, truth, np.where(hidden[:, None], np.nan, np.round(xy + noise, 3)),
-                              np.where(hidden, 0.0, np.round(confidence, 4))))
+            found.append(
+                Seen(
+                    ident,
+                    truth,
+                    np.where(hidden[:, None], np.nan, np.round(xy + noise, 3)),
+                    np.where(hidden, 0.0, np.round(confidence, 4)),
+                )
+            )
     return sorted(found, key=lambda seen: -np.ptp(seen.xy[np.isfinite(seen.xy[:, 1]), 1]))
 
 
@@ -155,7 +163,7 @@ def _behind(camera: Camera, xy: np.ndarray, other: np.ndarray) -> np.ndarray:
 def write(path: Path, camera: Camera, frames: list[list[Seen]]) -> None:
     """Uncompressed chunks: the bytes then depend on no compressor's version."""
     make = BagMessages()
-    with BagWriter(path, make, compression='none') as bag:
+    with BagWriter(path, make, compression="none") as bag:
         for number, persons in enumerate(frames):
             stamp = START + number * 1_000_000_000 // RATE
             for topic, message in _messages(make, camera, persons, stamp):
@@ -163,34 +171,44 @@ def write(path: Path, camera: Camera, frames: list[list[Seen]]) -> None:
 
 
 def _messages(make: BagMessages, camera: Camera, persons: list[Seen], stamp: int) -> Iterator[tuple[str, object]]:
-    time = make('builtin_interfaces/msg/Time', sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
-    header = make('std_msgs/msg/Header', stamp=time, frame_id=FRAME_ID)
+    time = make("builtin_interfaces/msg/Time", sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
+    header = make("std_msgs/msg/Header", stamp=time, frame_id=FRAME_ID)
     xy = np.array([person.xy for person in persons]).reshape(-1, 17, 2)
     confidence = np.array([person.confidence for person in persons]).reshape(-1, 17)
     truth = np.array([person.truth for person in persons]).reshape(-1, 17, 3)
-    yield '/camera_info', _camera_info(make, header, camera)
-    yield '/keypoints', keypoints_cloud(make, header, xy, confidence, [str(person.ident) for person in persons])
-    yield '/ground_truth/poses', pose_array(make, header, truth)
+    yield "/camera_info", _camera_info(make, header, camera)
+    yield "/keypoints", keypoints_cloud(make, header, xy, confidence, [str(person.ident) for person in persons])
+    yield "/ground_truth/poses", pose_array(make, header, truth)
 
 
 def _camera_info(make: BagMessages, header: object, camera: Camera) -> object:
     f, cx, cy = camera.focal, camera.width / 2, camera.height_px / 2
-    roi = make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    return make('sensor_msgs/msg/CameraInfo', header=header, height=camera.height_px, width=camera.width,
-                distortion_model='plumb_bob', d=np.zeros(5), k=np.array([f, 0, cx, 0, f, cy, 0, 0, 1.0]),
-                r=np.eye(3).ravel(), p=np.array([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0]),
-                binning_x=0, binning_y=0, roi=roi)
+    roi = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return make(
+        "sensor_msgs/msg/CameraInfo",
+        header=header,
+        height=camera.height_px,
+        width=camera.width,
+        distortion_model="plumb_bob",
+        d=np.zeros(5),
+        k=np.array([f, 0, cx, 0, f, cy, 0, 0, 1.0]),
+        r=np.eye(3).ravel(),
+        p=np.array([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1.0, 0]),
+        binning_x=0,
+        binning_y=0,
+        roi=roi,
+    )
 
 
-BAGS = {'one_person.mcap': one_person, 'two_persons_crossing.mcap': two_persons}
+BAGS = {"one_person.mcap": one_person, "two_persons_crossing.mcap": two_persons}
 
 
 def main(folder: Path) -> None:
     for name, scene in BAGS.items():
         camera, frames = scene()
         write(folder / name, camera, frames)
-        print(f'{folder / name}: {len(frames)} frames, {(folder / name).stat().st_size / 1e6:.2f} MB')
+        print(f"{folder / name}: {len(frames)} frames, {(folder / name).stat().st_size / 1e6:.2f} MB")
 
 
-if __name__ == '__main__':
+if __name__ == "__main__":
     main(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE)

@@ -13,9 +13,9 @@ from msg_adapters.keypoints import Intrinsics, Keypoints2D, MessageError, WrongP
 
 #: Type name -> reader(msg, points) -> Keypoints2D.
 SUPPORTED = {
-    'sensor_msgs/msg/PointCloud2': point_cloud2.read,
-    'geometry_msgs/msg/PoseArray': pose_array.read,
-    'yolo_msgs/msg/DetectionArray': yolo.read,
+    "sensor_msgs/msg/PointCloud2": point_cloud2.read,
+    "geometry_msgs/msg/PoseArray": pose_array.read,
+    "yolo_msgs/msg/DetectionArray": yolo.read,
 }
 
 
@@ -26,10 +26,11 @@ def read(type_name: str, msg, points: int) -> Keypoints2D:
     """
     reader = SUPPORTED.get(type_name)
     if reader is None:
-        raise MessageError('unknown_type', f'{type_name} is no keypoint message that can be read here; '
-                                           f'readable are {", ".join(SUPPORTED)}')
+        raise MessageError(
+            "unknown_type",
+            f"{type_name} is no keypoint message that can be read here; readable are {', '.join(SUPPORTED)}",
+        )
     return reader(msg, points)
 
 
-__all__ = ['Intrinsics', 'Keypoints2D', 'MessageError', 'SUPPORTED', 'WrongPointCount', 'read',
-           'read_camera_info']
+__all__ = ["Intrinsics", "Keypoints2D", "MessageError", "SUPPORTED", "WrongPointCount", "read", "read_camera_info"]

@@ -16,6 +16,9 @@ def read_camera_info(msg) -> Intrinsics:
     """
     fx, fy, cx, cy = (float(msg.k[index]) for index in (0, 4, 2, 5))
     if not (0 < fx < math.inf and 0 < fy < math.inf and math.isfinite(cx) and math.isfinite(cy)):
-        raise MessageError('bad_intrinsics', f'CameraInfo has fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}: '
-                           'focal lengths must be positive; calibrate the camera or correct its driver')
+        raise MessageError(
+            "bad_intrinsics",
+            f"CameraInfo has fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}: "
+            "focal lengths must be positive; calibrate the camera or correct its driver",
+        )
     return Intrinsics(fx, fy, cx, cy, int(msg.width), int(msg.height))

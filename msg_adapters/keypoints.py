@@ -27,7 +27,7 @@ class WrongPointCount(MessageError):
     """The message has another number of keypoints than the layout. ``fits(points)`` tells which would do."""
 
     def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
-        super().__init__('wrong_point_count', advice)
+        super().__init__("wrong_point_count", advice)
         self.fits = fits
 
 
@@ -37,8 +37,9 @@ def split_persons(total: int, points: int) -> int:
     Raises WrongPointCount where it holds no whole number of persons.
     """
     if total % points:
-        raise WrongPointCount(f'{total} keypoints are no multiple of the {points} of the layout',
-                              lambda other: total % other == 0)
+        raise WrongPointCount(
+            f"{total} keypoints are no multiple of the {points} of the layout", lambda other: total % other == 0
+        )
     return total // points
 
 
@@ -84,8 +85,9 @@ def stamp_ns(header) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-def record(xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header,
-           present: np.ndarray | None = None) -> Keypoints2D:
+def record(
+    xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header, present: np.ndarray | None = None
+) -> Keypoints2D:
     """Makes the record from raw arrays: what no camera can have seen becomes missing.
 
     xy (N, P, 2) in any real type; confidence (N, P) or None where the message has none; present (N, P) bool
@@ -94,7 +96,7 @@ def record(xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], 
     Confidences are clipped to 0..1: some detectors' peaks reach a little above one.
     """
     xy = np.array(xy, dtype=np.float64)
-    with np.errstate(invalid='ignore'):
+    with np.errstate(invalid="ignore"):
         visible = (np.abs(xy) <= ABSURD_PIXELS).all(axis=-1)
     if present is not None:
         visible &= present

@@ -17,16 +17,18 @@ _ADD, _DELETE = 0, 2
 _MARKER_SECONDS = 1
 
 #: Colours of the sides as (r, g, b): left red and right green, as on ships.
-SIDE_COLOURS = {'left': (0.9, 0.2, 0.2), 'right': (0.2, 0.75, 0.3), '': (0.35, 0.55, 0.95)}
+SIDE_COLOURS = {"left": (0.9, 0.2, 0.2), "right": (0.2, 0.75, 0.3), "": (0.35, 0.55, 0.95)}
 _OBSERVED_ALPHA, _HIDDEN_ALPHA = 1.0, 0.3
 
 
 def pose_array(make, header, points: np.ndarray):
     """geometry_msgs/PoseArray of points (N, P, 3), person-major, identity orientation."""
     identity = _quaternion(make)
-    poses = [make('geometry_msgs/msg/Pose', position=_point(make, xyz), orientation=identity)
-             for xyz in points.reshape(-1, 3).tolist()]
-    return make('geometry_msgs/msg/PoseArray', header=header, poses=poses)
+    poses = [
+        make("geometry_msgs/msg/Pose", position=_point(make, xyz), orientation=identity)
+        for xyz in points.reshape(-1, 3).tolist()
+    ]
+    return make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
 
 
 def keypoints_cloud(make, header, xy: np.ndarray, confidence: np.ndarray, person_ids):
@@ -36,8 +38,7 @@ def keypoints_cloud(make, header, xy: np.ndarray, confidence: np.ndarray, person
     """
     persons, points = confidence.shape
     ids = np.broadcast_to(id_numbers(person_ids)[:, None], (persons, points))
-    return _cloud(make, header, ('x', 'y', 'confidence', 'person_id'),
-                  [xy[..., 0], xy[..., 1], confidence, ids])
+    return _cloud(make, header, ("x", "y", "confidence", "person_id"), [xy[..., 0], xy[..., 1], confidence, ids])
 
 
 def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids):
@@ -48,8 +49,12 @@ def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids):
     persons, count = confidence.shape
     keypoint = np.broadcast_to(np.arange(count), (persons, count))
     person = np.broadcast_to(id_numbers(ids)[:, None], (persons, count))
-    return _cloud(make, header, ('x', 'y', 'z', 'confidence', 'keypoint', 'person_id'),
-                  [points[..., 0], points[..., 1], points[..., 2], confidence, keypoint, person])
+    return _cloud(
+        make,
+        header,
+        ("x", "y", "z", "confidence", "keypoint", "person_id"),
+        [points[..., 0], points[..., 1], points[..., 2], confidence, keypoint, person],
+    )
 
 
 def skeleton_markers(make, header, points: np.ndarray, observed: np.ndarray, edges, sides, thickness: float):
@@ -64,11 +69,20 @@ def skeleton_markers(make, header, points: np.ndarray, observed: np.ndarray, edg
     bones = points[:, edges].reshape(-1, 3)
     bones_seen = observed[:, edges].all(axis=-1).repeat(2)
     palette = _palette(make)
-    lines = _marker(make, header, 0, 'bones', _LINE_LIST, thickness, bones,
-                    _colours(palette, np.repeat(bone_sides, 2), bones_seen))
-    spheres = _marker(make, header, 1, 'keypoints', _SPHERE_LIST, 2 * thickness, points.reshape(-1, 3),
-                      _colours(palette, sides, observed.reshape(-1)))
-    return make('visualization_msgs/msg/MarkerArray', markers=[lines, spheres])
+    lines = _marker(
+        make, header, 0, "bones", _LINE_LIST, thickness, bones, _colours(palette, np.repeat(bone_sides, 2), bones_seen)
+    )
+    spheres = _marker(
+        make,
+        header,
+        1,
+        "keypoints",
+        _SPHERE_LIST,
+        2 * thickness,
+        points.reshape(-1, 3),
+        _colours(palette, sides, observed.reshape(-1)),
+    )
+    return make("visualization_msgs/msg/MarkerArray", markers=[lines, spheres])
 
 
 def id_numbers(ids) -> np.ndarray:
@@ -83,45 +97,69 @@ def id_numbers(ids) -> np.ndarray:
 
 
 def _id_number(text: str, row: int) -> int:
-    if text == '':
+    if text == "":
         return -1
-    return int(text) if text.isdecimal() and int(text) <= 2 ** 24 else row
+    return int(text) if text.isdecimal() and int(text) <= 2**24 else row
 
 
 def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray]):
     """An organised float32 PointCloud2 of columns, each (height, width)."""
-    data = np.stack(columns, axis=-1).astype('<f4')
+    data = np.stack(columns, axis=-1).astype("<f4")
     height, width, count = data.shape
-    fields = [make('sensor_msgs/msg/PointField', name=name, offset=4 * index, datatype=_FLOAT32, count=1)
-              for index, name in enumerate(names)]
-    return make('sensor_msgs/msg/PointCloud2', header=header, height=height, width=width, fields=fields,
-                is_bigendian=False, point_step=4 * count, row_step=4 * count * width,
-                data=make.octets(data.tobytes()), is_dense=bool(np.isfinite(data).all()))
+    fields = [
+        make("sensor_msgs/msg/PointField", name=name, offset=4 * index, datatype=_FLOAT32, count=1)
+        for index, name in enumerate(names)
+    ]
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=header,
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=False,
+        point_step=4 * count,
+        row_step=4 * count * width,
+        data=make.octets(data.tobytes()),
+        is_dense=bool(np.isfinite(data).all()),
+    )
 
 
 def _marker(make, header, index: int, name: str, kind: int, size: float, points: np.ndarray, colours: list):
     """One marker of a packed kind. It expires by itself when no further frame comes."""
-    seconds = make('builtin_interfaces/msg/Duration', sec=_MARKER_SECONDS, nanosec=0)
-    zero = make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
-    nothing = make('std_msgs/msg/Header', stamp=zero, frame_id='')
+    seconds = make("builtin_interfaces/msg/Duration", sec=_MARKER_SECONDS, nanosec=0)
+    zero = make("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+    nothing = make("std_msgs/msg/Header", stamp=zero, frame_id="")
     return make(
-        'visualization_msgs/msg/Marker', header=header, ns=name, id=index, type=kind,
+        "visualization_msgs/msg/Marker",
+        header=header,
+        ns=name,
+        id=index,
+        type=kind,
         action=_ADD if len(points) else _DELETE,
-        pose=make('geometry_msgs/msg/Pose', position=_point(make, (0.0, 0.0, 0.0)),
-                  orientation=_quaternion(make)),
-        scale=make('geometry_msgs/msg/Vector3', x=float(size), y=float(size), z=float(size)),
-        color=_colour(make, SIDE_COLOURS[''], _OBSERVED_ALPHA), lifetime=seconds, frame_locked=False,
-        points=[_point(make, xyz) for xyz in points.tolist()], colors=colours, texture_resource='',
-        texture=make('sensor_msgs/msg/CompressedImage', header=nothing, format='', data=make.octets(b'')),
-        uv_coordinates=[], text='', mesh_resource='',
-        mesh_file=make('visualization_msgs/msg/MeshFile', filename='', data=make.octets(b'')),
-        mesh_use_embedded_materials=False)
+        pose=make("geometry_msgs/msg/Pose", position=_point(make, (0.0, 0.0, 0.0)), orientation=_quaternion(make)),
+        scale=make("geometry_msgs/msg/Vector3", x=float(size), y=float(size), z=float(size)),
+        color=_colour(make, SIDE_COLOURS[""], _OBSERVED_ALPHA),
+        lifetime=seconds,
+        frame_locked=False,
+        points=[_point(make, xyz) for xyz in points.tolist()],
+        colors=colours,
+        texture_resource="",
+        texture=make("sensor_msgs/msg/CompressedImage", header=nothing, format="", data=make.octets(b"")),
+        uv_coordinates=[],
+        text="",
+        mesh_resource="",
+        mesh_file=make("visualization_msgs/msg/MeshFile", filename="", data=make.octets(b"")),
+        mesh_use_embedded_materials=False,
+    )
 
 
 def _palette(make) -> dict:
     """(side, observed) -> colour message; shared by all points, which is what makes many points cheap."""
-    return {(side, observed): _colour(make, rgb, _OBSERVED_ALPHA if observed else _HIDDEN_ALPHA)
-            for side, rgb in SIDE_COLOURS.items() for observed in (True, False)}
+    return {
+        (side, observed): _colour(make, rgb, _OBSERVED_ALPHA if observed else _HIDDEN_ALPHA)
+        for side, rgb in SIDE_COLOURS.items()
+        for observed in (True, False)
+    }
 
 
 def _colours(palette: dict, sides, observed: np.ndarray) -> list:
@@ -130,12 +168,12 @@ def _colours(palette: dict, sides, observed: np.ndarray) -> list:
 
 
 def _colour(make, rgb, alpha: float):
-    return make('std_msgs/msg/ColorRGBA', r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
+    return make("std_msgs/msg/ColorRGBA", r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
 
 
 def _point(make, xyz):
-    return make('geometry_msgs/msg/Point', x=xyz[0], y=xyz[1], z=xyz[2])
+    return make("geometry_msgs/msg/Point", x=xyz[0], y=xyz[1], z=xyz[2])
 
 
 def _quaternion(make):
-    return make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
+    return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)

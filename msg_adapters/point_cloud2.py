@@ -13,7 +13,7 @@ import numpy as np
 from msg_adapters.keypoints import Keypoints2D, MessageError, WrongPointCount, record, split_persons
 
 #: sensor_msgs/PointField datatype -> numpy type without byte order.
-_DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def read(msg, points: int) -> Keypoints2D:
@@ -28,40 +28,56 @@ def read(msg, points: int) -> Keypoints2D:
     dtype = _point_type(msg)
     cloud = np.ndarray((msg.height, msg.width), dtype, buffer=msg.data, strides=(row_step, msg.point_step))
     cloud = _persons_first(cloud, points)
-    xy = np.stack([cloud['x'], cloud['y']], axis=-1)
-    confidence = cloud['confidence'] if 'confidence' in dtype.names else None
-    ids = _ids(cloud['person_id']) if 'person_id' in dtype.names else ('',) * len(cloud)
+    xy = np.stack([cloud["x"], cloud["y"]], axis=-1)
+    confidence = cloud["confidence"] if "confidence" in dtype.names else None
+    ids = _ids(cloud["person_id"]) if "person_id" in dtype.names else ("",) * len(cloud)
     return record(xy, confidence, ids, msg.header)
 
 
 def _point_type(msg) -> np.dtype:
     """The structured type of one point: only the fields that are read, where the message says they lie."""
     fields = {field.name: field for field in msg.fields}
-    if 'x' not in fields or 'y' not in fields:
-        raise MessageError('wrong_fields', f'the cloud has the fields {_listed(fields)}; 2D keypoints need '
-                           'x and y in pixels, and may have confidence and person_id')
-    if 'z' in fields:
-        raise MessageError('not_2d', 'the cloud has a field z, so it is a 3D cloud; send 2D keypoints, '
-                           'x and y in pixels without z')
-    wanted = [fields[name] for name in ('x', 'y', 'confidence', 'person_id') if name in fields]
-    order = '>' if msg.is_bigendian else '<'
+    if "x" not in fields or "y" not in fields:
+        raise MessageError(
+            "wrong_fields",
+            f"the cloud has the fields {_listed(fields)}; 2D keypoints need "
+            "x and y in pixels, and may have confidence and person_id",
+        )
+    if "z" in fields:
+        raise MessageError(
+            "not_2d", "the cloud has a field z, so it is a 3D cloud; send 2D keypoints, x and y in pixels without z"
+        )
+    wanted = [fields[name] for name in ("x", "y", "confidence", "person_id") if name in fields]
+    order = ">" if msg.is_bigendian else "<"
     formats = [order + _format(field) for field in wanted]
     for field, form in zip(wanted, formats):
         if field.offset + np.dtype(form).itemsize > msg.point_step:
-            raise MessageError('wrong_steps', f'field {field.name} at offset {field.offset} reaches beyond '
-                               f'point_step {msg.point_step}; correct offsets or point_step')
-    return np.dtype({'names': [field.name for field in wanted], 'formats': formats,
-                     'offsets': [field.offset for field in wanted], 'itemsize': msg.point_step})
+            raise MessageError(
+                "wrong_steps",
+                f"field {field.name} at offset {field.offset} reaches beyond "
+                f"point_step {msg.point_step}; correct offsets or point_step",
+            )
+    return np.dtype(
+        {
+            "names": [field.name for field in wanted],
+            "formats": formats,
+            "offsets": [field.offset for field in wanted],
+            "itemsize": msg.point_step,
+        }
+    )
 
 
 def _format(field) -> str:
     """The numpy type of one field. A count of 0 is taken as 1: some publishers leave it unset."""
     form = _DATATYPES.get(field.datatype)
     if form is None or field.count > 1:
-        raise MessageError('wrong_fields', f'field {field.name} has datatype {field.datatype} and count '
-                           f'{field.count}; it must be one number of a PointField datatype 1..8')
-    if field.name == 'confidence' and form[0] != 'f':
-        raise MessageError('wrong_fields', 'field confidence is an integer; send it as float32 in 0..1')
+        raise MessageError(
+            "wrong_fields",
+            f"field {field.name} has datatype {field.datatype} and count "
+            f"{field.count}; it must be one number of a PointField datatype 1..8",
+        )
+    if field.name == "confidence" and form[0] != "f":
+        raise MessageError("wrong_fields", "field confidence is an integer; send it as float32 in 0..1")
     return form
 
 
@@ -71,12 +87,18 @@ def _row_step(msg) -> int:
     # A single row needs no row_step, and many publishers of flat clouds leave it 0.
     row_step = row_bytes if msg.height == 1 else msg.row_step
     if row_step < row_bytes:
-        raise MessageError('wrong_steps', f'row_step {row_step} is less than width {msg.width} x point_step '
-                           f'{msg.point_step}; set row_step to at least {row_bytes}')
+        raise MessageError(
+            "wrong_steps",
+            f"row_step {row_step} is less than width {msg.width} x point_step "
+            f"{msg.point_step}; set row_step to at least {row_bytes}",
+        )
     needed = (msg.height - 1) * row_step + row_bytes
     if len(msg.data) < needed:
-        raise MessageError('truncated_data', f'{msg.height} x {msg.width} points need {needed} bytes, '
-                           f'the message has {len(msg.data)}; correct height, width or data')
+        raise MessageError(
+            "truncated_data",
+            f"{msg.height} x {msg.width} points need {needed} bytes, "
+            f"the message has {len(msg.data)}; correct height, width or data",
+        )
     return row_step
 
 
@@ -86,8 +108,9 @@ def _persons_first(cloud: np.ndarray, points: int) -> np.ndarray:
     if height == 1:
         return cloud.reshape(split_persons(width, points), points)
     if width != points:
-        raise WrongPointCount(f'the cloud has {width} keypoints a person (its width), the layout {points}',
-                              lambda other: other == width)
+        raise WrongPointCount(
+            f"the cloud has {width} keypoints a person (its width), the layout {points}", lambda other: other == width
+        )
     return cloud
 
 
@@ -96,8 +119,8 @@ def _ids(column: np.ndarray) -> tuple[str, ...]:
     column = column.astype(np.float64)
     known = np.isfinite(column) & (column >= 0)
     first = np.take_along_axis(column, known.argmax(axis=1)[:, None], axis=1)[:, 0]
-    return tuple(f'{value:.0f}' if is_known else '' for value, is_known in zip(first, known.any(axis=1)))
+    return tuple(f"{value:.0f}" if is_known else "" for value, is_known in zip(first, known.any(axis=1)))
 
 
 def _listed(fields: dict) -> str:
-    return ', '.join(fields) or 'none'
+    return ", ".join(fields) or "none"

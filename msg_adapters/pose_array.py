@@ -23,9 +23,11 @@ def read(msg, points: int) -> Keypoints2D:
     xyz = np.array([(p.x, p.y, p.z) for p in positions], dtype=np.float64).reshape(persons, points, 3)
     z = xyz[..., 2]
     if ((z < 0) | (z > 1)).any():
-        raise MessageError('not_2d', 'a pose has z outside 0..1, so these look like 3D poses; send x and y '
-                           'in pixels and z = confidence, or 0')
+        raise MessageError(
+            "not_2d",
+            "a pose has z outside 0..1, so these look like 3D poses; send x and y in pixels and z = confidence, or 0",
+        )
     confidence = z if (z > 0).any() else None
     filled = (xyz != 0).any(axis=-1)
     present = filled & ~np.isnan(z)
-    return record(xyz[..., :2], confidence, ('',) * persons, msg.header, present)
+    return record(xyz[..., :2], confidence, ("",) * persons, msg.header, present)

@@ -33,8 +33,10 @@ def read(msg, points: int) -> Keypoints2D:
 def _column(keypoint_id: int, points: int) -> int:
     """The layout's column of a 1-based keypoint id."""
     if keypoint_id < 1:
-        raise MessageError('wrong_keypoint_id', f'keypoint id {keypoint_id}; yolo_msgs counts from 1')
+        raise MessageError("wrong_keypoint_id", f"keypoint id {keypoint_id}; yolo_msgs counts from 1")
     if keypoint_id > points:
-        raise WrongPointCount(f'keypoint id {keypoint_id} is beyond the {points} keypoints of the layout',
-                              lambda other: other >= keypoint_id)
+        raise WrongPointCount(
+            f"keypoint id {keypoint_id} is beyond the {points} keypoints of the layout",
+            lambda other: other >= keypoint_id,
+        )
     return keypoint_id - 1

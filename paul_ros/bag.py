@@ -4,6 +4,7 @@
 The container is handled by `mcap`, the messages by `rosbags`; both come with the extra `bags` and are imported only
 when a bag is opened. A damaged bag gives what can still be read, then a BagError that says how much that was.
 """
+
 from __future__ import annotations
 
 import os
@@ -15,16 +16,16 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Iterator
 
-MCAP_MAGIC = b'\x89MCAP0\r\n'
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 # A recorder that is killed loses its open chunk: small chunks lose about a second of keypoints.
 _CHUNK_BYTES = 64 * 1024
-_RECORD_HEAD = struct.Struct('<BQ')  # opcode, length (mcap specification, "Records")
+_RECORD_HEAD = struct.Struct("<BQ")  # opcode, length (mcap specification, "Records")
 
 LATCHED_QOS = (
-    '- history: keep_last\n  depth: 1\n  reliability: reliable\n  durability: transient_local\n'
-    '  deadline:\n    sec: 9223372036\n    nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n'
-    '  liveliness: automatic\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n'
-    '  avoid_ros_namespace_conventions: false\n'
+    "- history: keep_last\n  depth: 1\n  reliability: reliable\n  durability: transient_local\n"
+    "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  liveliness: automatic\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  avoid_ros_namespace_conventions: false\n"
 )
 """Offered QoS of a latched topic, as rosbag2 (metadata version 9) spells it."""
 
@@ -45,12 +46,12 @@ class Record:
     """One message of a bag as it lies there: CDR bytes beside the definition that explains them."""
 
     topic: str
-    type_name: str         # 'sensor_msgs/msg/PointCloud2'
-    data: bytes            # CDR with its 4-byte encapsulation header
-    log_time: int          # ns
-    definition: str = ''   # '' = the Jazzy definition of that name
-    encoding: str = 'ros2msg'
-    qos: str = ''
+    type_name: str  # 'sensor_msgs/msg/PointCloud2'
+    data: bytes  # CDR with its 4-byte encapsulation header
+    log_time: int  # ns
+    definition: str = ""  # '' = the Jazzy definition of that name
+    encoding: str = "ros2msg"
+    qos: str = ""
 
     def message(self) -> Any:
         """The decoded message: a dataclass with the field names of the rclpy message. Raises BagError."""
@@ -59,7 +60,7 @@ class Record:
         except BagError:
             raise
         except Exception as error:  # rosbags raises many kinds for bytes that do not fit their definition
-            raise BagError(f'a {self.type_name} message on {self.topic} does not decode: {error}') from error
+            raise BagError(f"a {self.type_name} message on {self.topic} does not decode: {error}") from error
 
 
 def read_messages(path: str | Path, topics: Any = None) -> Iterator[tuple[str, str, Any, int]]:
@@ -84,7 +85,7 @@ def topics_of(path: str | Path) -> dict[str, tuple[str, int]]:
     """{topic: (type name, number of messages)} by reading the whole bag. Raises BagError."""
     found: dict[str, tuple[str, int]] = {}
     for record in read_records(path):
-        found[record.topic] = (record.type_name, found.get(record.topic, ('', 0))[1] + 1)
+        found[record.topic] = (record.type_name, found.get(record.topic, ("", 0))[1] + 1)
     return found
 
 
@@ -130,10 +131,10 @@ class BagWriter:
     reads up to the last whole chunk. Equal input gives equal bytes. compression: 'zstd', 'lz4' or 'none'.
     """
 
-    def __init__(self, path: str | Path, messages: BagMessages | None = None, compression: str = 'zstd'):
-        _need('mcap')
+    def __init__(self, path: str | Path, messages: BagMessages | None = None, compression: str = "zstd"):
+        _need("mcap")
         self.path = Path(path)
-        self.part = self.path.with_name(self.path.name + '.part')
+        self.part = self.path.with_name(self.path.name + ".part")
         self.count = 0
         self._compression = compression
         self._messages = messages or BagMessages()
@@ -145,21 +146,25 @@ class BagWriter:
 
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = open(self.part, 'wb', buffering=4096)  # a chunk is more, so it reaches the system at once
+            self._file = open(self.part, "wb", buffering=4096)  # a chunk is more, so it reaches the system at once
         except OSError as error:
-            raise BagError(f'cannot write {self.path}: {error.strerror}') from error
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True,
-                              compression=CompressionType[self._compression.upper()])
-        self._writer.start(profile='ros2', library='paul_ros')
+            raise BagError(f"cannot write {self.path}: {error.strerror}") from error
+        self._writer = Writer(
+            self._file,
+            chunk_size=_CHUNK_BYTES,
+            enable_data_crcs=True,
+            compression=CompressionType[self._compression.upper()],
+        )
+        self._writer.start(profile="ros2", library="paul_ros")
         return self
 
-    def write(self, topic: str, message: Any, log_time: int, qos: str = '') -> None:
+    def write(self, topic: str, message: Any, log_time: int, qos: str = "") -> None:
         """Append a message made by BagMessages (or read from a bag whose type Jazzy knows); log_time in ns."""
         self.write_cdr(topic, message.__msgtype__, self._messages.serialise(message), log_time, qos)
 
-    def write_cdr(self, topic: str, type_name: str, data: bytes, log_time: int, qos: str = '') -> None:
+    def write_cdr(self, topic: str, type_name: str, data: bytes, log_time: int, qos: str = "") -> None:
         """Append a serialised message of a type that this writer's factory knows."""
-        definition = '' if topic in self._channels else self._messages.definition(type_name)
+        definition = "" if topic in self._channels else self._messages.definition(type_name)
         self.write_record(Record(topic, type_name, data, log_time, definition, qos=qos))
 
     def write_record(self, record: Record) -> None:
@@ -172,9 +177,11 @@ class BagWriter:
     def _add_channel(self, record: Record) -> int:
         if record.type_name not in self._schemas:
             self._schemas[record.type_name] = self._writer.register_schema(
-                record.type_name, record.encoding, record.definition.encode())
+                record.type_name, record.encoding, record.definition.encode()
+            )
         self._channels[record.topic] = self._writer.register_channel(
-            record.topic, 'cdr', self._schemas[record.type_name], {'offered_qos_profiles': record.qos})
+            record.topic, "cdr", self._schemas[record.type_name], {"offered_qos_profiles": record.qos}
+        )
         return self._channels[record.topic]
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
@@ -196,7 +203,7 @@ def _need(module: str) -> None:
 
 
 def _fresh_jazzy() -> Any:
-    _need('rosbags')
+    _need("rosbags")
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -210,34 +217,35 @@ def _typestore(type_name: str, definition: str, encoding: str) -> Any:
     """A store of its own for each definition: two bags may disagree on a type of one name."""
     if not definition:
         return _jazzy()
-    _need('rosbags')
+    _need("rosbags")
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
-    if encoding == 'ros2msg':
+    if encoding == "ros2msg":
         store.register(get_types_from_msg(definition, type_name))
-    elif encoding == 'ros2idl':
+    elif encoding == "ros2idl":
         types: dict = {}
-        for part in definition.split('=' * 80 + '\n'):
+        for part in definition.split("=" * 80 + "\n"):
             if part.strip():
-                types.update(get_types_from_idl(part.split('\n', 1)[1]))
+                types.update(get_types_from_idl(part.split("\n", 1)[1]))
         store.register(types)
     else:
-        raise BagError(f'{type_name} is described in {encoding!r}; ros2msg and ros2idl can be read')
+        raise BagError(f"{type_name} is described in {encoding!r}; ros2msg and ros2idl can be read")
     return store
 
 
 def _files(path: Path) -> list[Path]:
     """The mcap files of a bag in recording order."""
     if not path.exists():
-        raise BagError(f'{path}: no such bag')
+        raise BagError(f"{path}: no such bag")
     if path.is_file():
         return [path]
-    files = _files_in_metadata(path / 'metadata.yaml') if (path / 'metadata.yaml').exists() else []
-    files = files or sorted(path.glob('*.mcap'))
+    files = _files_in_metadata(path / "metadata.yaml") if (path / "metadata.yaml").exists() else []
+    files = files or sorted(path.glob("*.mcap"))
     if not files:
-        raise BagError(f'{path}: no .mcap file in this folder; another storage is turned into mcap by '
-                       '`ros2 bag convert`')
+        raise BagError(
+            f"{path}: no .mcap file in this folder; another storage is turned into mcap by `ros2 bag convert`"
+        )
     return files
 
 
@@ -245,11 +253,11 @@ def _files_in_metadata(metadata: Path) -> list[Path]:
     import yaml
 
     try:
-        names = yaml.safe_load(metadata.read_text())['rosbag2_bagfile_information']['relative_file_paths']
+        names = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
         files = [metadata.parent / Path(name).name for name in names]
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
         return []  # a recorder that was killed leaves no metadata, or half of it; the files speak for themselves
-    return [file for file in files if file.suffix == '.mcap' and file.exists()]
+    return [file for file in files if file.suffix == ".mcap" and file.exists()]
 
 
 @dataclass
@@ -263,10 +271,10 @@ class _Progress:
 
 
 def _read_file(file: Path, wanted: frozenset | None) -> Iterator[Record]:
-    _need('mcap')
+    _need("mcap")
     state = _Progress(file)
     try:
-        with open(file, 'rb') as stream:
+        with open(file, "rb") as stream:
             size = _check_start(stream, file)
             for opcode, body in _records(stream, size):
                 for record in _messages_in(opcode, body, state):
@@ -275,21 +283,26 @@ def _read_file(file: Path, wanted: frozenset | None) -> Iterator[Record]:
     except BagError:
         raise
     except OSError as error:
-        raise BagError(f'{file}: {error.strerror}', state.count) from error
+        raise BagError(f"{file}: {error.strerror}", state.count) from error
     except Exception as error:  # damaged bytes surface as struct, zstd, lz4, Unicode, CRC and many other errors
-        raise BagError(f'{file}: damaged after {state.count} whole messages ({error or type(error).__name__}); those '
-                       f'were read. Record it again, or try `mcap recover {file.name}`', state.count) from error
+        raise BagError(
+            f"{file}: damaged after {state.count} whole messages ({error or type(error).__name__}); those "
+            f"were read. Record it again, or try `mcap recover {file.name}`",
+            state.count,
+        ) from error
 
 
 def _check_start(stream: BinaryIO, file: Path) -> int:
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
     if size == 0:
-        raise BagError(f'{file}: the file is empty (0 bytes); the recording never began')
+        raise BagError(f"{file}: the file is empty (0 bytes); the recording never began")
     start = stream.read(len(MCAP_MAGIC))
     if start != MCAP_MAGIC:
-        raise BagError(f'{file}: not an mcap file; `ros2 bag convert` turns other bags into mcap, `zstd -d` unpacks '
-                       'compressed files')
+        raise BagError(
+            f"{file}: not an mcap file; `ros2 bag convert` turns other bags into mcap, `zstd -d` unpacks "
+            "compressed files"
+        )
     return size
 
 
@@ -301,18 +314,18 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, bytes]]:
     while True:
         head = stream.read(_RECORD_HEAD.size)
         if len(head) < _RECORD_HEAD.size:
-            raise ValueError('the file ends too early')
+            raise ValueError("the file ends too early")
         opcode, length = _RECORD_HEAD.unpack(head)
         if length > size - stream.tell():
-            raise ValueError('the file ends in the middle of a record')
+            raise ValueError("the file ends in the middle of a record")
         body = stream.read(length)
         if opcode == Opcode.FOOTER:
             _check_footer(body, head, crc)
             if stream.read() != MCAP_MAGIC:
-                raise ValueError('the end mark is missing')
+                raise ValueError("the end mark is missing")
             return
         if opcode == Opcode.DATA_END:
-            _check_crc(struct.unpack('<I', body)[0], crc, 'the data section')
+            _check_crc(struct.unpack("<I", body)[0], crc, "the data section")
             crc = 0  # what follows is the summary, with a checksum of its own
         else:
             crc = zlib.crc32(body, zlib.crc32(head, crc))
@@ -321,12 +334,12 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, bytes]]:
 
 def _check_footer(body: bytes, head: bytes, crc: int) -> None:
     """The summary's checksum covers it and the footer up to the checksum itself."""
-    _check_crc(struct.unpack('<I', body[16:])[0], zlib.crc32(head + body[:16], crc), 'the summary')
+    _check_crc(struct.unpack("<I", body[16:])[0], zlib.crc32(head + body[:16], crc), "the summary")
 
 
 def _check_crc(stated: int, found: int, what: str) -> None:
     if stated not in (0, found):  # 0 = not computed, says the specification
-        raise ValueError(f'checksum of {what} is wrong')
+        raise ValueError(f"checksum of {what} is wrong")
 
 
 def _messages_in(opcode: int, body: bytes, state: _Progress) -> Iterator[Record]:
@@ -356,9 +369,18 @@ def _messages_in(opcode: int, body: bytes, state: _Progress) -> Iterator[Record]
 
 
 def _record(message: Any, channel: Any, state: _Progress) -> Record:
-    if channel.message_encoding != 'cdr':
-        raise BagError(f'{state.file}: {channel.topic} is encoded as {channel.message_encoding!r}, not cdr: '
-                       'not a ROS 2 bag', state.count)
+    if channel.message_encoding != "cdr":
+        raise BagError(
+            f"{state.file}: {channel.topic} is encoded as {channel.message_encoding!r}, not cdr: not a ROS 2 bag",
+            state.count,
+        )
     schema = state.schemas[channel.schema_id]
-    return Record(channel.topic, schema.name, message.data, message.log_time, schema.data.decode(), schema.encoding,
-                  channel.metadata.get('offered_qos_profiles', ''))
+    return Record(
+        channel.topic,
+        schema.name,
+        message.data,
+        message.log_time,
+        schema.data.decode(),
+        schema.encoding,
+        channel.metadata.get("offered_qos_profiles", ""),
+    )

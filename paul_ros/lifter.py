@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Lifter: 2D keypoints of single frames to 3D points in the camera frame, with error, ambiguity and units stated."""
+"""The Lifter: 2D keypoints of single frames to 3D points in the camera frame; error, ambiguity and units stated."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ import numpy as np
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.model import Model
 from paul_ros.onp import onp
-from paul_ros.placement import centred_view, place
+from paul_ros.placement import centred_view, place, undo_perspective
 
 TOO_FEW_POINTS = "too_few_points"
 DEGENERATE_POINTS = "degenerate_points"
@@ -28,7 +29,7 @@ class Lifted:
         root: (N,3) the layout's root point, same frame and units.
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
-        reprojection: (N,) pixels, root mean square over the visible points under weak perspective.
+        reprojection: (N,) pixels, root mean square over the visible points.
         ambiguity: (N,) 0..1, residual of the pose over that of its mirrored rival; 1 means undecidable.
         certified: (N,) the pose is the proven optimum of orthographic-N-point.
         reason: N slugs, '' where lifted, else why not.
@@ -100,6 +101,9 @@ class Lifter:
             visible = visible & np.isfinite(W).all(1)
         S = self.model.shape(W, visible).astype(float)
         pose = onp(S, W, visible)
+        if camera is not None:
+            # Once is enough: it leaves half a pixel and 5 mm of a person 2.5 m away, a tenth of that at 6 m.
+            pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible, start=pose.R)
         good = pose.determined & (pose.scale > 0)
         camera_shape = pose.R @ S
         root = list(self.model.layout.root)

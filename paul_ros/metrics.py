@@ -4,6 +4,7 @@
 All take predictions and ground truth as points (N,P,3) in the camera frame, equal units, and give (N,) errors, one a
 shape, in those units (NE: a ratio).  Both sets are centred on their mean first; none of them sees absolute position.
 """
+
 from __future__ import annotations
 
 import numpy as np

@@ -4,6 +4,7 @@
 A model file is an ``.npz`` archive of float32 weights, the mean shape and one JSON header.  Its last 64 bytes (the zip
 comment) are the SHA-256 of all bytes before them, so that any change to the file is noticed.  Nothing is unpickled.
 """
+
 from __future__ import annotations
 
 import difflib
@@ -87,19 +88,6 @@ class Model:
         """The baseline that always answers with the mean shape."""
         return RigidModel(**vars(self))
 
-    def check_layout(self, layout: Layout) -> None:
-        """Refuse data of another layout.
-
-        Raises:
-            ModelError: the names or their order differ.
-        """
-        if layout.names != self.layout.names:
-            raise ModelError(
-                f"model '{self.name}' was trained on layout '{self.layout.name}' ({len(self.layout.names)} points), "
-                f"the data is '{layout.name}' ({len(layout.names)} points): map it with Layout.map_to, "
-                f"or train a model on it with `paul train`"
-            )
-
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
         return x @ self.weights[f"{name}.weight"].T + self.weights[f"{name}.bias"]
 
@@ -117,7 +105,7 @@ def min_visible(points: int) -> int:
 
 
 def normalise(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Image points (N,2,P) centred on the mean of the visible ones, their root mean square distance 1; hidden ones 0."""
+    """Image points (N,2,P) about the mean of the visible ones, in units of their rms distance to it; hidden ones 0."""
     seen = visible[:, None, :]
     count = np.maximum(visible.sum(1), 1)[:, None, None]
     W = np.where(seen, W, 0.0)
@@ -212,7 +200,11 @@ def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
 
 def weight_shapes(header: dict, points: int) -> dict[str, tuple[int, ...]]:
     """Shapes of all arrays that a model with this header and P points must hold."""
-    encoder, hidden, K = header["architecture"]["encoder"], header["architecture"]["decoder"]["hidden"], header["bottleneck"]
+    encoder, hidden, K = (
+        header["architecture"]["encoder"],
+        header["architecture"]["decoder"]["hidden"],
+        header["bottleneck"],
+    )
     width = encoder["width"]
     layers = {"encoder.input": (width, 3 * points), "encoder.output": (K, width)}
     for block in range(encoder["blocks"]):

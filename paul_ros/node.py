@@ -10,8 +10,8 @@ from __future__ import annotations
 import os
 
 # Before numpy: its threads cost up to 100x on matrices as small as these, and rob the robot's other nodes.
-for _variable in ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'):
-    os.environ[_variable] = '1'
+for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_variable] = "1"
 
 import argparse
 import array
@@ -57,11 +57,11 @@ _STOP_SECONDS = 0.2
 @functools.cache
 def message_class(type_name: str) -> type:
     """The class of 'package/msg/Name'; raises ImportError where its package is not installed."""
-    package, _, name = type_name.split('/')
+    package, _, name = type_name.split("/")
     try:
-        return getattr(importlib.import_module(f'{package}.msg'), name)
+        return getattr(importlib.import_module(f"{package}.msg"), name)
     except AttributeError:
-        raise ImportError(f'{package} has no message {name}') from None
+        raise ImportError(f"{package} has no message {name}") from None
 
 
 class RosMake:
@@ -72,7 +72,7 @@ class RosMake:
 
     @staticmethod
     def octets(data: bytes) -> array.array:
-        return array.array('B', data)
+        return array.array("B", data)
 
 
 class LifterNode(Node):
@@ -80,24 +80,26 @@ class LifterNode(Node):
 
     def __init__(self) -> None:
         """Raises ModelError or LayoutError where the parameters name something that cannot be used."""
-        super().__init__('lifter')
+        super().__init__("lifter")
         self._make = RosMake()
         # Discovery and the first frames take their time: silence is worth a warning only after a while.
-        self._warned = {'no input': time.monotonic(), 'silent': time.monotonic()}
+        self._warned = {"no input": time.monotonic(), "silent": time.monotonic()}
         self._reported: Counter = Counter()
         self._described: dict = {}
-        self._topic = self.resolve_topic_name('keypoints')
+        self._topic = self.resolve_topic_name("keypoints")
         self._input_type: str | None = None
         self._seen: Counter = Counter()
         self._last_number = 0
         values = self._declare_parameters()
         self.stream = self._open_stream(values)
         self.add_post_set_parameters_callback(self._take_parameters)
-        self._outputs = {name: self.create_publisher(message_class(type_name), f'~/{name}', _OUTPUT_QOS)
-                         for name, type_name in OUTPUTS.items()}
-        self._layout = self.create_publisher(String, '~/layout', _LATCHED_QOS)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', _OUTPUT_QOS)
-        self.create_subscription(CameraInfo, 'camera_info', self._on_camera_info, _INPUT_QOS)
+        self._outputs = {
+            name: self.create_publisher(message_class(type_name), f"~/{name}", _OUTPUT_QOS)
+            for name, type_name in OUTPUTS.items()
+        }
+        self._layout = self.create_publisher(String, "~/layout", _LATCHED_QOS)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
+        self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, _INPUT_QOS)
         self._publish_layout()
         self._look_timer = self.create_timer(_LOOK_SECONDS, self._look_for_input)
         self.create_timer(1.0, self._publish_diagnostics)
@@ -106,29 +108,33 @@ class LifterNode(Node):
         """What was done, in one line."""
         counts = self.stream.counts
         median, p99 = _microseconds(self.stream.lift_us)
-        return (f'lifter: {counts["frames"]} frames, {counts["lifted"]} of {counts["persons"]} persons '
-                f'lifted, median {median:.0f} µs, p99 {p99:.0f} µs a frame; '
-                f'dropped: {_listed(self.stream.drops)}')
+        return (
+            f"lifter: {counts['frames']} frames, {counts['lifted']} of {counts['persons']} persons "
+            f"lifted, median {median:.0f} µs, p99 {p99:.0f} µs a frame; "
+            f"dropped: {_listed(self.stream.drops)}"
+        )
 
     # --- parameters
 
     def _declare_parameters(self) -> dict:
-        return {parameter.name: self.declare_parameter(parameter.name, parameter.default,
-                                                       _descriptor(parameter)).value
-                for parameter in PARAMETERS}
+        return {
+            parameter.name: self.declare_parameter(parameter.name, parameter.default, _descriptor(parameter)).value
+            for parameter in PARAMETERS
+        }
 
     def _open_stream(self, values: dict) -> LiftStream:
-        self._wanted_type = values['input_type']
-        if self._wanted_type != 'auto' and self._wanted_type not in msg_adapters.SUPPORTED:
-            raise ValueError(f'input_type is {self._wanted_type}; it must be auto or one of '
-                             f'{", ".join(msg_adapters.SUPPORTED)}')
-        model = load_model(values['model'])
-        layout = load_layout(values['layout']) if values['layout'] else model.layout
-        return LiftStream(Lifter(model), layout, values['min_confidence'], values['max_persons'])
+        self._wanted_type = values["input_type"]
+        if self._wanted_type != "auto" and self._wanted_type not in msg_adapters.SUPPORTED:
+            raise ValueError(
+                f"input_type is {self._wanted_type}; it must be auto or one of {', '.join(msg_adapters.SUPPORTED)}"
+            )
+        model = load_model(values["model"])
+        layout = load_layout(values["layout"]) if values["layout"] else model.layout
+        return LiftStream(Lifter(model), layout, values["min_confidence"], values["max_persons"])
 
     def _take_parameters(self, parameters) -> None:
         for parameter in parameters:
-            if parameter.name in ('min_confidence', 'max_persons'):
+            if parameter.name in ("min_confidence", "max_persons"):
                 setattr(self.stream, parameter.name, parameter.value)
 
     # --- topics
@@ -136,14 +142,17 @@ class LifterNode(Node):
     def _look_for_input(self) -> None:
         """Subscribes as soon as the type of the input is known; until then says aloud what is missing."""
         topic, types = self._topic, [self._wanted_type]
-        if self._wanted_type == 'auto':
+        if self._wanted_type == "auto":
             types = sorted({info.topic_type for info in self.get_publishers_info_by_topic(topic)})
         readable = [name for name in types if name in msg_adapters.SUPPORTED]
         if not types:
-            self._warn('no input', f'nobody publishes {topic} yet; remap `keypoints` to your detector')
+            self._warn("no input", f"nobody publishes {topic} yet; remap `keypoints` to your detector")
         elif not readable:
-            self._warn('unknown type', f'{topic} has the type {", ".join(types)}, which cannot be read; '
-                                       f'readable are {", ".join(msg_adapters.SUPPORTED)}')
+            self._warn(
+                "unknown type",
+                f"{topic} has the type {', '.join(types)}, which cannot be read; "
+                f"readable are {', '.join(msg_adapters.SUPPORTED)}",
+            )
         else:
             self._subscribe_keypoints(readable[0])
 
@@ -151,13 +160,16 @@ class LifterNode(Node):
         try:
             kind = message_class(type_name)
         except ImportError as error:
-            self._warn('no package', f'{self._topic} has the type {type_name}, whose package cannot be '
-                                     f'imported ({error}); install it or source its workspace')
+            self._warn(
+                "no package",
+                f"{self._topic} has the type {type_name}, whose package cannot be "
+                f"imported ({error}); install it or source its workspace",
+            )
             return
         self.create_subscription(kind, self._topic, self._on_keypoints, _INPUT_QOS)
         self._input_type = type_name
         self._look_timer.cancel()
-        self.get_logger().info(f'reading {type_name} from {self._topic}')
+        self.get_logger().info(f"reading {type_name} from {self._topic}")
 
     # --- messages
 
@@ -167,7 +179,7 @@ class LifterNode(Node):
         self._publish_layout()
 
     def _on_keypoints(self, msg, info: dict) -> None:
-        self._count_missed(info['publication_sequence_number'])
+        self._count_missed(info["publication_sequence_number"])
         frame = self.stream.keypoints(self._input_type, msg)
         if frame is not None:
             with self.stream.guard():
@@ -182,8 +194,8 @@ class LifterNode(Node):
         missed = number - self._last_number - 1 if self._last_number else 0
         self._last_number = number
         if missed > 0 and self.count_publishers(self._topic) == 1:
-            self.stream.drops['missed'] += missed
-            self.stream.explanations['missed'] = 'Lost on the way, or newer came before they could be lifted'
+            self.stream.drops["missed"] += missed
+            self.stream.explanations["missed"] = "Lost on the way, or newer came before they could be lifted"
 
     def _publish(self, frame) -> None:
         """Builds and publishes what somebody listens to."""
@@ -197,7 +209,7 @@ class LifterNode(Node):
         if described == self._described:
             return
         if self._described:
-            self.get_logger().info(f'units are now {described["units"]}: {described["scale_source"]}')
+            self.get_logger().info(f"units are now {described['units']}: {described['scale_source']}")
         self._described = described
         self._layout.publish(String(data=json.dumps(described)))
 
@@ -214,11 +226,11 @@ class LifterNode(Node):
         for reason, count in self.stream.drops.items():
             if count != self._reported[reason]:
                 self._reported[reason] = count
-                explanation = self.stream.explanations.get(reason, '')
-                self._warn(reason, f'dropped: {reason}, {count} so far. {explanation}')
+                explanation = self.stream.explanations.get(reason, "")
+                self._warn(reason, f"dropped: {reason}, {count} so far. {explanation}")
 
     def _publish_diagnostics(self) -> None:
-        frames = self.stream.counts['frames'] - self._seen['frames']
+        frames = self.stream.counts["frames"] - self._seen["frames"]
         dropped = self.stream.drops - self._seen
         self._seen = self.stream.counts + self.stream.drops
         status = self._status(*self._health(frames, dropped))
@@ -226,36 +238,41 @@ class LifterNode(Node):
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
         # Not before the first second is over: CameraInfo may come a little later than the keypoints.
-        if frames and self.stream.units == 'model' and 'units' not in self._warned:
-            self._warn('units', f'lifting in model units, not metres: {self._described["scale_source"]}')
+        if frames and self.stream.units == "model" and "units" not in self._warned:
+            self._warn("units", f"lifting in model units, not metres: {self._described['scale_source']}")
 
     def _health(self, frames: int, dropped: Counter) -> tuple[bytes, str]:
         """Level and one line, from what came and what was dropped in the last second."""
         if self._input_type is None:
-            return DiagnosticStatus.WARN, 'no input yet'
+            return DiagnosticStatus.WARN, "no input yet"
         if frames:
-            self._warned['silent'] = time.monotonic()
+            self._warned["silent"] = time.monotonic()
         elif not dropped:
-            self._warn('silent', f'no keypoints for {_WARN_SECONDS:.0f} s')
-            return DiagnosticStatus.WARN, 'no keypoints in the last second'
-        message = f'{frames} frames in the last second, units: {self.stream.units}'
+            self._warn("silent", f"no keypoints for {_WARN_SECONDS:.0f} s")
+            return DiagnosticStatus.WARN, "no keypoints in the last second"
+        message = f"{frames} frames in the last second, units: {self.stream.units}"
         if not dropped:
             return DiagnosticStatus.OK, message
-        level = DiagnosticStatus.ERROR if dropped['internal_error'] else DiagnosticStatus.WARN
-        return level, f'{message}; dropped: {_listed(dropped)}'
+        level = DiagnosticStatus.ERROR if dropped["internal_error"] else DiagnosticStatus.WARN
+        return level, f"{message}; dropped: {_listed(dropped)}"
 
     def _status(self, level: bytes, message: str) -> DiagnosticStatus:
         stream = self.stream
         median, p99 = _microseconds(stream.lift_us)
-        values = {**stream.counts, **_prefixed('dropped_', stream.drops),
-                  **_prefixed('noted_', stream.notes),
-                  'lift_us_median': f'{median:.1f}', 'lift_us_p99': f'{p99:.1f}', 'units': stream.units,
-                  'input_type': self._input_type or 'none', 'model': self._described['model'],
-                  'model_sha256': self._described['model_sha256']}
+        values = {
+            **stream.counts,
+            **_prefixed("dropped_", stream.drops),
+            **_prefixed("noted_", stream.notes),
+            "lift_us_median": f"{median:.1f}",
+            "lift_us_p99": f"{p99:.1f}",
+            "units": stream.units,
+            "input_type": self._input_type or "none",
+            "model": self._described["model"],
+            "model_sha256": self._described["model_sha256"],
+        }
         pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        name = self.get_fully_qualified_name().lstrip('/')
-        return DiagnosticStatus(level=level, name=f'{name}: lifting', message=message, hardware_id='',
-                                values=pairs)
+        name = self.get_fully_qualified_name().lstrip("/")
+        return DiagnosticStatus(level=level, name=f"{name}: lifting", message=message, hardware_id="", values=pairs)
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
@@ -270,7 +287,7 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 
 def _listed(counter: Counter) -> str:
-    return ', '.join(f'{count} {reason}' for reason, count in sorted(counter.items())) or 'none'
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(counter.items())) or "none"
 
 
 def _prefixed(prefix: str, counter: Counter) -> dict:
@@ -284,19 +301,22 @@ def _microseconds(times) -> tuple[float, float]:
 
 def _process_seconds() -> float:
     """Seconds since this process started, by the kernel's clock."""
-    with open('/proc/self/stat', encoding='ascii') as file:
+    with open("/proc/self/stat", encoding="ascii") as file:
         # The second field, the name, may hold spaces; the start time is the 20th after it.
-        ticks = int(file.read().rpartition(')')[2].split()[19])
-    return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf('SC_CLK_TCK')
+        ticks = int(file.read().rpartition(")")[2].split()[19])
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
 
 
 def _parse(argv: list[str]) -> None:
     """There are only ROS arguments; --help tells which, anything else is refused."""
     parser = argparse.ArgumentParser(
-        prog='lifter', description='Lift 2D keypoints to 3D: subscribes keypoints and camera_info, '
-        'publishes ~/poses, ~/keypoints3d, ~/markers, ~/layout and /diagnostics.',
-        epilog='Set parameters with --ros-args -p NAME:=VALUE, topics with --ros-args -r keypoints:=TOPIC.'
-        f'\n\n{as_markdown()}', formatter_class=argparse.RawDescriptionHelpFormatter)
+        prog="lifter",
+        description="Lift 2D keypoints to 3D: subscribes keypoints and camera_info, "
+        "publishes ~/poses, ~/keypoints3d, ~/markers, ~/layout and /diagnostics.",
+        epilog="Set parameters with --ros-args -p NAME:=VALUE, topics with --ros-args -r keypoints:=TOPIC."
+        f"\n\n{as_markdown()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.parse_args(remove_ros_args(argv)[1:])
 
 
@@ -311,10 +331,10 @@ def main() -> int:
     try:
         node = LifterNode()
     except (ModelError, LayoutError, ParameterException, ValueError) as error:
-        print(f'lifter: {error}', file=sys.stderr)
+        print(f"lifter: {error}", file=sys.stderr)
         rclpy.shutdown()
         return 1
-    node.get_logger().info(f'ready {_process_seconds():.2f} s after the process started')
+    node.get_logger().info(f"ready {_process_seconds():.2f} s after the process started")
     _spin(node, stop)
     print(node.summary(), file=sys.stderr, flush=True)
     node.destroy_node()
@@ -329,5 +349,5 @@ def _spin(node: LifterNode, stop: threading.Event) -> None:
         executor.spin_once(timeout_sec=_STOP_SECONDS)
 
 
-if __name__ == '__main__':
+if __name__ == "__main__":
     sys.exit(main())

@@ -21,42 +21,47 @@ class Parameter:
 
 
 PARAMETERS = (
-    Parameter('model', 'human_coco17', 'Model file: the name of one that is shipped, or a path to a .npz.'),
-    Parameter('layout', '', 'Keypoint layout of the input: a name, or a path to a .yaml; '
-                            "empty = the model's own."),
-    Parameter('input_type', 'auto', 'Message type of `keypoints`, as sensor_msgs/msg/PointCloud2; '
-                                    'auto = the type of the first publisher that can be read.'),
-    Parameter('min_confidence', 0.3, 'Keypoints with a lower confidence count as hidden.', (0.0, 1.0),
-              live=True),
-    Parameter('max_persons', 64, 'Messages with more persons are dropped, counted as too_many_persons.',
-              (1, 10000), live=True),
+    Parameter("model", "human_coco17", "Model file: the name of one that is shipped, or a path to a .npz."),
+    Parameter("layout", "", "Keypoint layout of the input: a name, or a path to a .yaml; empty = the model's own."),
+    Parameter(
+        "input_type",
+        "auto",
+        "Message type of `keypoints`, as sensor_msgs/msg/PointCloud2; "
+        "auto = the type of the first publisher that can be read.",
+    ),
+    Parameter("min_confidence", 0.3, "Keypoints with a lower confidence count as hidden.", (0.0, 1.0), live=True),
+    Parameter(
+        "max_persons", 64, "Messages with more persons are dropped, counted as too_many_persons.", (1, 10000), live=True
+    ),
 )
 
 
 def as_yaml() -> str:
     """config/lifter.yaml: every parameter with its default and its description."""
-    blocks = ['# Parameters of the lifter, with their defaults. Made from paul_ros/parameters.py by\n'
-              '# python -m paul_ros.parameters > config/lifter.yaml\n'
-              '/**:\n  ros__parameters:\n']
+    blocks = [
+        "# Parameters of the lifter, with their defaults. Made from paul_ros/parameters.py by\n"
+        "# python -m paul_ros.parameters > config/lifter.yaml\n"
+        "/**:\n  ros__parameters:\n"
+    ]
     for parameter in PARAMETERS:
-        comment = textwrap.wrap(f'{parameter.description} ({_kind(parameter)})', 100)
+        comment = textwrap.wrap(f"{parameter.description} ({_kind(parameter)})", 100)
         value = yaml.safe_dump({parameter.name: parameter.default}).strip()
-        blocks.append(''.join(f'    # {line}\n' for line in comment) + f'    {value}\n')
-    return ''.join(blocks)
+        blocks.append("".join(f"    # {line}\n" for line in comment) + f"    {value}\n")
+    return "".join(blocks)
 
 
 def as_markdown() -> str:
     """The README's table of parameters."""
-    rows = [f'| `{p.name}` | `{p.default!r}` | {_kind(p)} | {p.description} |' for p in PARAMETERS]
-    return '\n'.join(['| parameter | default | may be set | meaning |', '|---|---|---|---|', *rows]) + '\n'
+    rows = [f"| `{p.name}` | `{p.default!r}` | {_kind(p)} | {p.description} |" for p in PARAMETERS]
+    return "\n".join(["| parameter | default | may be set | meaning |", "|---|---|---|---|", *rows]) + "\n"
 
 
 def _kind(parameter: Parameter) -> str:
-    when = 'at any time' if parameter.live else 'at start'
+    when = "at any time" if parameter.live else "at start"
     if parameter.limits is None:
         return when
-    return f'{when}, {parameter.limits[0]} to {parameter.limits[1]}'
+    return f"{when}, {parameter.limits[0]} to {parameter.limits[1]}"
 
 
-if __name__ == '__main__':
-    print(as_yaml(), end='')
+if __name__ == "__main__":
+    print(as_yaml(), end="")

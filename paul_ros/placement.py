@@ -6,6 +6,7 @@ camera turned towards it: the rays of its keypoints are rotated until the person
 Lifting happens there; the result is rotated back.  With scale ``s`` (normalised image units per model unit) and ``m``
 metres per model unit, similar triangles give the distance ``m / s``.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -36,8 +37,9 @@ def centred_view(xy: np.ndarray, visible: np.ndarray, camera: Intrinsics) -> Cen
         visible: (N,P) bool, at least one point a person.
         camera: pinhole intrinsics in pixels.
     """
-    rays = np.stack([(xy[..., 0] - camera.cx) / camera.fx, (xy[..., 1] - camera.cy) / camera.fy,
-                     np.ones(xy.shape[:2])], axis=2)
+    rays = np.stack(
+        [(xy[..., 0] - camera.cx) / camera.fx, (xy[..., 1] - camera.cy) / camera.fy, np.ones(xy.shape[:2])], axis=2
+    )
     rays = np.where(visible[..., None], rays, np.nan)
     towards = np.nanmean(rays, axis=1)
     turn = _turn_from_axis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
@@ -51,13 +53,33 @@ def _turn_from_axis(direction: np.ndarray) -> np.ndarray:
     """Smallest rotations (N,3,3) that take the optical axis (0,0,1) to unit directions (N,3) with z > 0."""
     x, y, z = direction.T
     k = 1.0 / (1.0 + z)
-    return np.stack([np.stack([1 - k * x * x, -k * x * y, x], axis=1),
-                     np.stack([-k * x * y, 1 - k * y * y, y], axis=1),
-                     np.stack([-x, -y, z], axis=1)], axis=1)
+    return np.stack(
+        [
+            np.stack([1 - k * x * x, -k * x * y, x], axis=1),
+            np.stack([-k * x * y, 1 - k * y * y, y], axis=1),
+            np.stack([-x, -y, z], axis=1),
+        ],
+        axis=1,
+    )
 
 
-def place(shape: np.ndarray, scale: np.ndarray, translation: np.ndarray, turn: np.ndarray,
-          metres_per_unit: float) -> np.ndarray:
+def undo_perspective(W: np.ndarray, shape: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The image points that weak perspective would have given, from those of a pinhole camera.
+
+    A pinhole camera at distance d sees ``u = X / (d + Z)``, weak perspective ``X / d = u (1 + Z / d)``.
+
+    Args:
+        W: (N,2,P) normalised image points of centred views.
+        shape: (N,3,P) the shapes as they stand in those views, model units, from a first guess of their pose.
+        scale: (N,) normalised image units per model unit, 1/d, from the same guess.
+    """
+    # The limits hold off a guess so wrong that it would put points behind the camera.
+    return W * np.clip(1 + scale[:, None, None] * shape[:, 2:], 0.5, 2.0)
+
+
+def place(
+    shape: np.ndarray, scale: np.ndarray, translation: np.ndarray, turn: np.ndarray, metres_per_unit: float
+) -> np.ndarray:
     """Put lifted shapes where the camera saw them.
 
     Args:

@@ -3,6 +3,7 @@
 
 Equal input gives an equal lifted bag, byte for byte. Nothing is dropped for want of time, as a live replay would.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -26,13 +27,19 @@ from paul_ros.parameters import PARAMETERS
 from paul_ros.skeleton import Mapping, load_layout
 from paul_ros.stream import LiftStream
 
-NODE = '/lifter'
+NODE = "/lifter"
 """Output topics lie below this name, as those of the node of that name do."""
-ERRORS = ('n_mpjpe_mm', 'pa_mpjpe_mm', 'ne_flip_frame_percent', 'ne_flip_global_percent', 'root_error_median_mm',
-          'root_error_median_percent')
+ERRORS = (
+    "n_mpjpe_mm",
+    "pa_mpjpe_mm",
+    "ne_flip_frame_percent",
+    "ne_flip_global_percent",
+    "root_error_median_mm",
+    "root_error_median_percent",
+)
 """The error keys of a report, and of the baseline in it."""
 
-CAMERA_INFO, POSE_ARRAY = 'sensor_msgs/msg/CameraInfo', 'geometry_msgs/msg/PoseArray'
+CAMERA_INFO, POSE_ARRAY = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseArray"
 _MM = 1000.0
 
 
@@ -44,9 +51,9 @@ class WrongTopic(BagError):
 class Topics:
     """What is read from the bag; the defaults are those of the bags in bags/."""
 
-    keypoints: str = '/keypoints'
-    camera_info: str = '/camera_info'
-    truth: str = '/ground_truth/poses'
+    keypoints: str = "/keypoints"
+    camera_info: str = "/camera_info"
+    truth: str = "/ground_truth/poses"
 
     @property
     def all(self) -> tuple[str, str, str]:
@@ -84,20 +91,29 @@ def open_stream(model: str | None = None, layout: str | None = None) -> LiftStre
     Raises ModelError, LayoutError.
     """
     default = {parameter.name: parameter.default for parameter in PARAMETERS}
-    loaded = load_model(model or default['model'])
-    return LiftStream(Lifter(loaded), load_layout(layout) if layout else loaded.layout,
-                      default['min_confidence'], default['max_persons'])
+    loaded = load_model(model or default["model"])
+    return LiftStream(
+        Lifter(loaded),
+        load_layout(layout) if layout else loaded.layout,
+        default["min_confidence"],
+        default["max_persons"],
+    )
 
 
-def replay(bag: Path, stream: LiftStream, out: Path | None = None, topics: Topics = Topics(),
-           on_frame: Callable[[], None] = lambda: None) -> Replay:
+def replay(
+    bag: Path,
+    stream: LiftStream,
+    out: Path | None = None,
+    topics: Topics = Topics(),
+    on_frame: Callable[[], None] = lambda: None,
+) -> Replay:
     """Lift every keypoint message of a bag; write input and output topics to the bag `out`, if given.
 
     A bag damaged somewhere in the middle is lifted up to there: `out` is then whole and says what was read, and the
     result names the damage. Raises BagError where nothing can be read, or nothing there is to be lifted.
     """
     if out is not None and bag.exists() and out.resolve() == bag.resolve():
-        raise BagError(f'{out}: is the bag that is read; name another output')
+        raise BagError(f"{out}: is the bag that is read; name another output")
     done = Replay(bag, stream)
     with BagWriter(out) if out else contextlib.nullcontext() as writer:
         shell = _Shell(done, topics, writer)
@@ -128,9 +144,9 @@ class _Shell:
         if self.writer:
             self.writer.write_record(record)
         if record.topic == self.topics.camera_info:
-            self.done.stream.camera_info(_decoded(record, CAMERA_INFO, '--camera-info-topic'))
+            self.done.stream.camera_info(_decoded(record, CAMERA_INFO, "--camera-info-topic"))
         elif record.topic == self.topics.truth:
-            self._take_truth(_decoded(record, POSE_ARRAY, '--ground-truth-topic'))
+            self._take_truth(_decoded(record, POSE_ARRAY, "--ground-truth-topic"))
         else:
             self._take_keypoints(record)
             return True
@@ -139,21 +155,21 @@ class _Shell:
     def _take_keypoints(self, record: Record) -> None:
         self.keypoint_messages += 1
         stream = self.done.stream
-        frame = stream.keypoints(record.type_name, _decoded(record, tuple(msg_adapters.SUPPORTED), '--topic'))
+        frame = stream.keypoints(record.type_name, _decoded(record, tuple(msg_adapters.SUPPORTED), "--topic"))
         self._write_layout(record.log_time)
         if frame is None:
             return
         self.done.frames.append(LiftedFrame(frame.keypoints.stamp, frame.keypoints, frame.lifted, stream.intrinsics))
         if self.writer:
             for name, message in frame.messages(self._make).items():
-                self.writer.write(f'{NODE}/{name}', message, record.log_time)
+                self.writer.write(f"{NODE}/{name}", message, record.log_time)
 
     def _take_truth(self, message: object) -> None:
         stream = self.done.stream
         flat = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses], float).reshape(-1, 3)
         points = len(stream.layout.names)
         if len(flat) % points:
-            stream.drops['truth_wrong_point_count'] += 1
+            stream.drops["truth_wrong_point_count"] += 1
             return
         mapping = stream.layout.map_to(stream.lifter.model.layout)
         self.done.truth[stamp_ns(message.header)] = map_points(mapping, flat.reshape(-1, points, 3))
@@ -162,8 +178,8 @@ class _Shell:
         described = self.done.stream.describe()
         if self.writer and described != self._described:
             self._described = described
-            message = self._make('std_msgs/msg/String', data=json.dumps(described))
-            self.writer.write(f'{NODE}/layout', message, log_time, LATCHED_QOS)
+            message = self._make("std_msgs/msg/String", data=json.dumps(described))
+            self.writer.write(f"{NODE}/layout", message, log_time, LATCHED_QOS)
 
 
 def map_points(mapping: Mapping, points: np.ndarray) -> np.ndarray:
@@ -177,15 +193,17 @@ def map_points(mapping: Mapping, points: np.ndarray) -> np.ndarray:
 
 def _decoded(record: Record, expected: str | tuple[str, ...], option: str) -> object:
     if record.type_name not in ([expected] if isinstance(expected, str) else expected):
-        wanted = expected if isinstance(expected, str) else ' or '.join(expected)
-        raise WrongTopic(f'{record.topic} is a {record.type_name}, not {wanted}: choose another with {option}')
+        wanted = expected if isinstance(expected, str) else " or ".join(expected)
+        raise WrongTopic(f"{record.topic} is a {record.type_name}, not {wanted}: choose another with {option}")
     return record.message()
 
 
 def _nothing_there(bag: Path, topics: Topics) -> str:
-    held = [f'{topic} ({kind})' for topic, (kind, _) in topics_of(bag).items()]
-    return (f'{bag}: no messages on {topics.keypoints}; the bag holds {", ".join(held) or "none at all"}. '
-            'Choose one with --topic')
+    held = [f"{topic} ({kind})" for topic, (kind, _) in topics_of(bag).items()]
+    return (
+        f"{bag}: no messages on {topics.keypoints}; the bag holds {', '.join(held) or 'none at all'}. "
+        "Choose one with --topic"
+    )
 
 
 # --- judging
@@ -203,32 +221,34 @@ def evaluate(done: Replay) -> dict:
     ok = [lifted.ok for lifted in lifts]
     times = np.array(stream.lift_us) if stream.lift_us else np.full(1, np.nan)
     return {
-        'bag': str(done.bag),
-        'frames': stream.counts['frames'],
-        'persons': stream.counts['persons'],
-        'lifted': stream.counts['lifted'],
-        'dropped': dict(sorted(stream.drops.items())),
-        'units': stream.units,
+        "bag": str(done.bag),
+        "frames": stream.counts["frames"],
+        "persons": stream.counts["persons"],
+        "lifted": stream.counts["lifted"],
+        "dropped": dict(sorted(stream.drops.items())),
+        "units": stream.units,
         **errors(with_truth(done, done.frames), model.layout.root),
-        'reprojection_median_px': _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),
-        'certified_share': _mean([lift.certified[good] for lift, good in zip(lifts, ok)]),
-        'ambiguous_share': _mean([lift.ambiguity[good] >= AMBIGUOUS for lift, good in zip(lifts, ok)]),
-        'lift_us_median': _number(np.median(times)),
-        'lift_us_p99': _number(np.percentile(times, 99)),
-        'baseline': errors(with_truth(done, rigid_frames(done)), model.layout.root),
-        'model': model.name,
-        'model_sha256': model.sha256,
-        'layout': model.layout.name,
-        'damage': str(done.damage) if done.damage else None,
-        'versions': versions(),
+        "reprojection_median_px": _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),
+        "certified_share": _mean([lift.certified[good] for lift, good in zip(lifts, ok)]),
+        "ambiguous_share": _mean([lift.ambiguity[good] >= AMBIGUOUS for lift, good in zip(lifts, ok)]),
+        "lift_us_median": _number(np.median(times)),
+        "lift_us_p99": _number(np.percentile(times, 99)),
+        "baseline": errors(with_truth(done, rigid_frames(done)), model.layout.root),
+        "model": model.name,
+        "model_sha256": model.sha256,
+        "layout": model.layout.name,
+        "damage": str(done.damage) if done.damage else None,
+        "versions": versions(),
     }
 
 
 def rigid_frames(done: Replay) -> list[LiftedFrame]:
     """The same frames lifted with the model's mean shape, the baseline."""
     rigid = Lifter(done.stream.lifter.model.rigid())
-    return [replace(frame, lifted=rigid.lift(frame.keypoints.xy, frame.keypoints.visible, frame.camera))
-            for frame in done.frames]
+    return [
+        replace(frame, lifted=rigid.lift(frame.keypoints.xy, frame.keypoints.visible, frame.camera))
+        for frame in done.frames
+    ]
 
 
 def with_truth(done: Replay, frames: list[LiftedFrame]) -> list[tuple[Lifted, np.ndarray]]:
@@ -241,16 +261,16 @@ def errors(pairs: list[tuple[Lifted, np.ndarray]], root: tuple[int, ...]) -> dic
     predicted, truth = matched(pairs)
     found: dict = dict.fromkeys(ERRORS)
     if len(predicted):
-        found['n_mpjpe_mm'] = _number(_MM * metrics.n_mpjpe(predicted, truth).mean())
-        found['pa_mpjpe_mm'] = _number(_MM * metrics.pa_mpjpe(predicted, truth).mean())
-    if len(predicted) and all(lifted.units == 'm' for lifted, _ in pairs):
-        found['ne_flip_frame_percent'] = _number(100 * metrics.normalised_error_flip_frame(predicted, truth).mean())
-        found['ne_flip_global_percent'] = _number(100 * metrics.normalised_error_flip_global(predicted, truth).mean())
+        found["n_mpjpe_mm"] = _number(_MM * metrics.n_mpjpe(predicted, truth).mean())
+        found["pa_mpjpe_mm"] = _number(_MM * metrics.pa_mpjpe(predicted, truth).mean())
+    if len(predicted) and all(lifted.units == "m" for lifted, _ in pairs):
+        found["ne_flip_frame_percent"] = _number(100 * metrics.normalised_error_flip_frame(predicted, truth).mean())
+        found["ne_flip_global_percent"] = _number(100 * metrics.normalised_error_flip_global(predicted, truth).mean())
         true_root = truth[:, root].mean(1)
         missed = np.linalg.norm(predicted[:, root].mean(1) - true_root, axis=1)
-        found['root_error_median_mm'] = _number(_MM * np.median(missed))
-        found['root_error_median_percent'] = _number(100 * np.median(missed / np.linalg.norm(true_root, axis=1)))
-    return {'persons_with_truth': len(predicted), **found}
+        found["root_error_median_mm"] = _number(_MM * np.median(missed))
+        found["root_error_median_percent"] = _number(100 * np.median(missed / np.linalg.norm(true_root, axis=1)))
+    return {"persons_with_truth": len(predicted), **found}
 
 
 def matched(pairs: list[tuple[Lifted, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -268,8 +288,8 @@ def matched(pairs: list[tuple[Lifted, np.ndarray]]) -> tuple[np.ndarray, np.ndar
 
 def versions() -> dict[str, str | None]:
     """Of what the figures depend on."""
-    found: dict[str, str | None] = {'paul_ros': __version__, 'python': platform.python_version()}
-    for package in ('numpy', 'mcap', 'rosbags'):
+    found: dict[str, str | None] = {"paul_ros": __version__, "python": platform.python_version()}
+    for package in ("numpy", "mcap", "rosbags"):
         try:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

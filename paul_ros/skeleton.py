@@ -4,6 +4,7 @@
 All shipped layouts name their points in one vocabulary, so a layout maps onto another by name alone. Points
 of two layouts that are only nearly the same place on the body have different names there.
 """
+
 from __future__ import annotations
 
 import difflib
@@ -85,13 +86,20 @@ class Layout:
             ],
         }
 
-    @property
+    @cached_property
     def mirror(self) -> np.ndarray:
         """(P,) indices: points[mirror] has left and right swapped."""
         order = np.arange(len(self.names))
         for left, right in self.left_right:
             order[[left, right]] = right, left
         return order
+
+    @cached_property
+    def mirrored_edges(self) -> np.ndarray:
+        """(E,) indices: for each edge the one on the other side, or itself where there is none."""
+        place = {frozenset(edge): index for index, edge in enumerate(self.edges)}
+        twins = (frozenset(self.mirror[list(edge)].tolist()) for edge in self.edges)
+        return np.array([place.get(twin, index) for index, twin in enumerate(twins)], int)
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -100,20 +108,6 @@ class Layout:
         for left, right in self.left_right:
             sides[left], sides[right] = "left", "right"
         return tuple(sides)
-
-    def difference(self, other: Layout) -> str:
-        """How the points of another layout differ, in one clause; '' where both have the same in order."""
-        if self.names == other.names:
-            return ""
-        missing = [name for name in self.names if name not in other.names]
-        added = [name for name in other.names if name not in self.names]
-        if not missing and not added:
-            pairs = enumerate(zip(self.names, other.names))
-            place, (here, there) = next((place, pair) for place, pair in pairs if pair[0] != pair[1])
-            return f"same points in another order, first at index {place}: '{there}' for '{here}'"
-        changes = {"without": missing, "with": added}
-        clauses = [f"{change} {_listed(names)}" for change, names in changes.items() if names]
-        return f"{len(other.names)} points for {len(self.names)}, " + " and ".join(clauses)
 
     def map_to(self, target: Layout) -> Mapping:
         """How arrays in this layout become arrays in the target's: by name, derived points as means.

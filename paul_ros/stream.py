@@ -45,7 +45,7 @@ class Frame:
 
     def message(self, output: str, make):
         """One output message by name, of OUTPUTS; persons that were not lifted are left out."""
-        return getattr(self, '_' + output)(make, self.lifted.ok)
+        return getattr(self, "_" + output)(make, self.lifted.ok)
 
     def messages(self, make) -> dict:
         """All output messages by name."""
@@ -57,20 +57,25 @@ class Frame:
     def _keypoints3d(self, make, ok: np.ndarray):
         # An id that is no number becomes its row of the input, so rows are numbered before any is left out.
         ids = outputs.id_numbers(self.keypoints.ids)[ok]
-        return outputs.points_cloud(make, self.header, self.lifted.points[ok],
-                                    self.keypoints.confidence[ok], ids)
+        return outputs.points_cloud(make, self.header, self.lifted.points[ok], self.keypoints.confidence[ok], ids)
 
     def _markers(self, make, ok: np.ndarray):
-        return outputs.skeleton_markers(make, self.header, self.lifted.points[ok],
-                                        self.keypoints.visible[ok], self.layout.edges, self.layout.sides,
-                                        self.bone_width)
+        return outputs.skeleton_markers(
+            make,
+            self.header,
+            self.lifted.points[ok],
+            self.keypoints.visible[ok],
+            self.layout.edges,
+            self.layout.sides,
+            self.bone_width,
+        )
 
 
 #: Output name -> type name of its message.
 OUTPUTS = {
-    'poses': 'geometry_msgs/msg/PoseArray',
-    'keypoints3d': 'sensor_msgs/msg/PointCloud2',
-    'markers': 'visualization_msgs/msg/MarkerArray',
+    "poses": "geometry_msgs/msg/PoseArray",
+    "keypoints3d": "sensor_msgs/msg/PointCloud2",
+    "markers": "visualization_msgs/msg/MarkerArray",
 }
 
 
@@ -101,7 +106,7 @@ class LiftStream:
     def units(self) -> str:
         """'m' once the intrinsics are known and the model knows its size, else 'model'."""
         metric = self.intrinsics is not None and self.lifter.model.metres_per_unit is not None
-        return 'm' if metric else 'model'
+        return "m" if metric else "model"
 
     def camera_info(self, msg) -> None:
         """Takes the intrinsics; of an unusable CameraInfo nothing is taken and the drop is counted."""
@@ -120,37 +125,40 @@ class LiftStream:
         try:
             yield
         except WrongPointCount as error:
-            self._drop(error.reason, f'{error}; {_layout_advice(error)}')
+            self._drop(error.reason, f"{error}; {_layout_advice(error)}")
         except MessageError as error:
             self._drop(error.reason, str(error))
         except Exception as error:
-            if not self.drops['internal_error']:
-                _log.exception('a message could not be lifted; this is a fault of paul_ros, please report it')
-            self._drop('internal_error', f'{type(error).__name__}: {error}')
+            if not self.drops["internal_error"]:
+                _log.exception("a message could not be lifted; this is a fault of paul_ros, please report it")
+            self._drop("internal_error", f"{type(error).__name__}: {error}")
 
     def describe(self) -> dict:
         """What the outputs mean, for ~/layout and the head of a report."""
         model = self.lifter.model
         return {
-            'layout': model.layout.name,
-            'keypoints': list(model.layout.names),
-            'edges': [list(edge) for edge in model.layout.edges],
-            'sides': list(model.layout.sides),
-            'input_layout': self.layout.name,
-            'units': self.units,
-            'frame': 'header.frame_id of the input, an optical frame (REP-103): x right, y down, z forward',
-            'scale_source': _scale_source(self.intrinsics, model.metres_per_unit),
-            'chirality': model.header.get('chirality'),
-            'model': model.name,
-            'model_sha256': model.sha256,
-            'metres_per_unit': model.metres_per_unit,
+            "layout": model.layout.name,
+            "keypoints": list(model.layout.names),
+            "edges": [list(edge) for edge in model.layout.edges],
+            "sides": list(model.layout.sides),
+            "input_layout": self.layout.name,
+            "units": self.units,
+            "frame": "header.frame_id of the input, an optical frame (REP-103): x right, y down, z forward",
+            "scale_source": _scale_source(self.intrinsics, model.metres_per_unit),
+            "chirality": model.header.get("chirality"),
+            "model": model.name,
+            "model_sha256": model.sha256,
+            "metres_per_unit": model.metres_per_unit,
         }
 
     def _read(self, type_name: str, msg) -> Keypoints2D:
         keypoints = msg_adapters.read(type_name, msg, len(self.layout.names))
         if keypoints.persons > self.max_persons:
-            raise MessageError('too_many_persons', f'{keypoints.persons} persons in one message; if that is '
-                               f'right, raise the parameter `max_persons` above {self.max_persons}')
+            raise MessageError(
+                "too_many_persons",
+                f"{keypoints.persons} persons in one message; if that is "
+                f"right, raise the parameter `max_persons` above {self.max_persons}",
+            )
         return self._in_model_layout(keypoints)
 
     def _in_model_layout(self, keypoints: Keypoints2D) -> Keypoints2D:
@@ -161,14 +169,14 @@ class LiftStream:
     def _frame(self, header, keypoints: Keypoints2D) -> Frame:
         # Every frame is lifted for itself, so time may run backwards, as when a bag loops; it is only noted.
         if self._last_stamp is not None and keypoints.stamp < self._last_stamp:
-            self.notes['stamp_backwards'] += 1
+            self.notes["stamp_backwards"] += 1
         self._last_stamp = keypoints.stamp
         lifted = self._lift(keypoints)
         self.counts.update(frames=1, persons=keypoints.persons, lifted=int(lifted.ok.sum()))
         for reason in filter(None, lifted.reason):
-            self._drop('person_' + reason, 'this person is left out of the outputs')
+            self._drop("person_" + reason, "this person is left out of the outputs")
         model = self.lifter.model
-        unit = model.metres_per_unit if lifted.units == 'm' else 1.0
+        unit = model.metres_per_unit if lifted.units == "m" else 1.0
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
         return Frame(header, keypoints, lifted, model.layout, width)
 
@@ -186,9 +194,9 @@ class LiftStream:
 
 def _scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) -> str:
     if metres_per_unit is None:
-        return 'none: the model does not know its size in metres'
+        return "none: the model does not know its size in metres"
     if intrinsics is None:
-        return 'none: no usable CameraInfo has come'
+        return "none: no usable CameraInfo has come"
     return "the model's metres per unit; distance from the camera's focal length"
 
 
@@ -200,5 +208,5 @@ def _layout_sizes() -> dict[str, int]:
 def _layout_advice(error: WrongPointCount) -> str:
     fitting = [name for name, points in _layout_sizes().items() if error.fits(points)]
     if not fitting:
-        return 'no shipped layout has that many; set the parameter `layout` to the path of one of your own'
-    return f'set the parameter `layout` to the one your detector uses: {", ".join(fitting)}'
+        return "no shipped layout has that many; set the parameter `layout` to the path of one of your own"
+    return f"set the parameter `layout` to the one your detector uses: {', '.join(fitting)}"

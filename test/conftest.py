@@ -7,9 +7,9 @@ import os
 
 # Before any test imports rclpy, and inherited by the processes that tests start.
 os.environ.update(
-    ROS_PYTHON_CHECK_FIELDS='1',
-    ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
-    RMW_IMPLEMENTATION='rmw_fastrtps_cpp',
+    ROS_PYTHON_CHECK_FIELDS="1",
+    ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
+    RMW_IMPLEMENTATION="rmw_fastrtps_cpp",
     ROS_DOMAIN_ID=str(1 + os.getpid() % 100),
 )
 
@@ -28,12 +28,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 #: yolo_msgs of yolo_ros, as far as keypoints go; the package itself is on no index.
 YOLO_DEFINITIONS = {
-    'yolo_msgs/msg/Point2D': 'float64 x\nfloat64 y\n',
-    'yolo_msgs/msg/KeyPoint2D': 'int32 id\nyolo_msgs/Point2D point\nfloat64 score\n',
-    'yolo_msgs/msg/KeyPoint2DArray': 'yolo_msgs/KeyPoint2D[] data\n',
-    'yolo_msgs/msg/Detection': 'int32 class_id\nstring class_name\nfloat64 score\nstring id\n'
-                               'yolo_msgs/KeyPoint2DArray keypoints\n',
-    'yolo_msgs/msg/DetectionArray': 'std_msgs/Header header\nyolo_msgs/Detection[] detections\n',
+    "yolo_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
+    "yolo_msgs/msg/KeyPoint2D": "int32 id\nyolo_msgs/Point2D point\nfloat64 score\n",
+    "yolo_msgs/msg/KeyPoint2DArray": "yolo_msgs/KeyPoint2D[] data\n",
+    "yolo_msgs/msg/Detection": "int32 class_id\nstring class_name\nfloat64 score\nstring id\n"
+    "yolo_msgs/KeyPoint2DArray keypoints\n",
+    "yolo_msgs/msg/DetectionArray": "std_msgs/Header header\nyolo_msgs/Detection[] detections\n",
 }
 
 
@@ -41,12 +41,12 @@ class RosMake:
     """Factory of rclpy's message classes."""
 
     def __call__(self, type_name: str, **fields):
-        package, _, name = type_name.split('/')
-        return getattr(importlib.import_module(f'{package}.msg'), name)(**fields)
+        package, _, name = type_name.split("/")
+        return getattr(importlib.import_module(f"{package}.msg"), name)(**fields)
 
     @staticmethod
     def octets(data: bytes):
-        return array.array('B', data)
+        return array.array("B", data)
 
 
 class BagMake:
@@ -70,47 +70,67 @@ class BagMake:
         return self.store.deserialize_cdr(self.store.serialize_cdr(msg, name), name)
 
 
-@pytest.fixture(scope='session')
+@pytest.fixture(scope="session")
 def bag_make() -> BagMake:
     return BagMake()
 
 
-@pytest.fixture(scope='session', params=['rclpy', 'rosbags'])
+@pytest.fixture(scope="session", params=["rclpy", "rosbags"])
 def make(request, bag_make):
     """Every test that asks for it runs with rclpy's classes and with rosbags'."""
-    return RosMake() if request.param == 'rclpy' else bag_make
+    return RosMake() if request.param == "rclpy" else bag_make
 
 
-def header_of(make, seconds: int = 7, nanoseconds: int = 5, frame: str = 'camera_color_optical_frame'):
-    stamp = make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
-    return make('std_msgs/msg/Header', stamp=stamp, frame_id=frame)
+def header_of(make, seconds: int = 7, nanoseconds: int = 5, frame: str = "camera_color_optical_frame"):
+    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
 #: A standing person in metres, x right, y down, z forward, who looks at the camera: the COCO points in order.
-PERSON = np.array([
-    (0, -0.62, -0.12), (0.03, -0.66, -0.09), (-0.03, -0.66, -0.09), (0.07, -0.64, 0), (-0.07, -0.64, 0),
-    (0.2, -0.4, 0.02), (-0.2, -0.4, 0.02), (0.3, -0.15, 0.05), (-0.25, -0.15, -0.1), (0.33, 0.05, -0.1),
-    (-0.2, 0, -0.3), (0.12, 0.1, 0), (-0.12, 0.1, 0), (0.14, 0.5, -0.1), (-0.13, 0.5, 0.05),
-    (0.15, 0.9, 0.05), (-0.14, 0.9, 0.1)])
+PERSON = np.array(
+    [
+        (0, -0.62, -0.12),
+        (0.03, -0.66, -0.09),
+        (-0.03, -0.66, -0.09),
+        (0.07, -0.64, 0),
+        (-0.07, -0.64, 0),
+        (0.2, -0.4, 0.02),
+        (-0.2, -0.4, 0.02),
+        (0.3, -0.15, 0.05),
+        (-0.25, -0.15, -0.1),
+        (0.33, 0.05, -0.1),
+        (-0.2, 0, -0.3),
+        (0.12, 0.1, 0),
+        (-0.12, 0.1, 0),
+        (0.14, 0.5, -0.1),
+        (-0.13, 0.5, 0.05),
+        (0.15, 0.9, 0.05),
+        (-0.14, 0.9, 0.1),
+    ]
+)
 FOCAL, CENTRE = 600.0, (320.0, 240.0)
 
 
-@pytest.fixture(scope='session')
+@pytest.fixture(scope="session")
 def model_file(tmp_path_factory) -> Path:
     """A model file whose every shape is PERSON: its only weights that are not zero are the last bias."""
     from paul_ros.model import save_model, to_unit_size, weight_shapes
     from paul_ros.skeleton import load_layout
 
-    layout = load_layout('coco17')
+    layout = load_layout("coco17")
     shape = to_unit_size(PERSON.T[None], layout)[0]
     start, end = np.array(layout.edges).T
     metres = float(np.linalg.norm(PERSON[start] - PERSON[end], axis=1).mean())
-    header = {'layout': layout.to_dict(), 'bottleneck': 2, 'metres_per_unit': metres,
-              'chirality': {'known': True, 'source': 'made by hand'},
-              'architecture': {'encoder': {'width': 4, 'blocks': 1}, 'decoder': {'hidden': [4]}}}
+    header = {
+        "layout": layout.to_dict(),
+        "bottleneck": 2,
+        "metres_per_unit": metres,
+        "chirality": {"known": True, "source": "made by hand"},
+        "architecture": {"encoder": {"width": 4, "blocks": 1}, "decoder": {"hidden": [4]}},
+    }
     arrays = {name: np.zeros(size) for name, size in weight_shapes(header, 17).items()}
-    arrays['mean_shape'], arrays['decoder.1.bias'] = shape, shape.ravel()
-    path = tmp_path_factory.mktemp('model') / 'stand.npz'
+    arrays["mean_shape"], arrays["decoder.1.bias"] = shape, shape.ravel()
+    path = tmp_path_factory.mktemp("model") / "stand.npz"
     save_model(path, header, arrays)
     return path
 
@@ -126,12 +146,22 @@ def seen(points: np.ndarray) -> np.ndarray:
 
 
 def camera_info(make, fx: float = FOCAL, fy: float = FOCAL, cx: float = CENTRE[0]):
-    region = make('sensor_msgs/msg/RegionOfInterest', x_offset=0, y_offset=0, height=0, width=0,
-                  do_rectify=False)
+    region = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     k = np.array([fx, 0, cx, 0, fy, CENTRE[1], 0, 0, 1])
-    return make('sensor_msgs/msg/CameraInfo', header=header_of(make), height=480, width=640,
-                distortion_model='plumb_bob', d=np.zeros(5), k=k, r=np.zeros(9), p=np.zeros(12),
-                binning_x=0, binning_y=0, roi=region)
+    return make(
+        "sensor_msgs/msg/CameraInfo",
+        header=header_of(make),
+        height=480,
+        width=640,
+        distortion_model="plumb_bob",
+        d=np.zeros(5),
+        k=k,
+        r=np.zeros(9),
+        p=np.zeros(12),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
 
 
 class LifterProcess:
@@ -139,13 +169,17 @@ class LifterProcess:
 
     def __init__(self, folder: Path, namespace: str, *ros_args: str) -> None:
         self.namespace = namespace
-        self._log = folder / f'{namespace}.log'
+        self._log = folder / f"{namespace}.log"
         # The wheels' start-up hook marks its work here, and a child that inherits the mark skips it.
-        env = {key: value for key, value in os.environ.items() if key != '_ROS_WHEELS_BOOTSTRAP_COMPLETE'}
-        with open(self._log, 'wb') as log:
+        env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+        with open(self._log, "wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, '-m', 'paul_ros.node', '--ros-args', '-r', f'__ns:=/{namespace}', *ros_args],
-                cwd=ROOT, env=env, stdout=log, stderr=subprocess.STDOUT)
+                [sys.executable, "-m", "paul_ros.node", "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
+                cwd=ROOT,
+                env=env,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
 
     def log(self) -> str:
         return self._log.read_text()
@@ -156,23 +190,25 @@ class LifterProcess:
         return self.process.wait(20)
 
 
-@pytest.fixture(scope='session')
+@pytest.fixture(scope="session")
 def ros():
     """rclpy, started in the test's own process."""
     import rclpy
+
     rclpy.init()
     yield rclpy
     rclpy.shutdown()
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def start_lifter(tmp_path_factory):
     """start_lifter(*ros_args) -> LifterProcess; all are ended with the module."""
-    folder, started = tmp_path_factory.mktemp('nodes'), []
+    folder, started = tmp_path_factory.mktemp("nodes"), []
 
     def start(*ros_args: str) -> LifterProcess:
-        started.append(LifterProcess(folder, f'test{len(started)}', *ros_args))
+        started.append(LifterProcess(folder, f"test{len(started)}", *ros_args))
         return started[-1]
+
     yield start
     for lifter in started:
         # Not by SIGKILL: that would leave the middleware's shared memory behind.

@@ -9,10 +9,9 @@ from conftest import camera_info, header_of
 
 from msg_adapters import MessageError, WrongPointCount, outputs, read, read_camera_info
 
-CLOUD, POSES, YOLO = ('sensor_msgs/msg/PointCloud2', 'geometry_msgs/msg/PoseArray',
-                      'yolo_msgs/msg/DetectionArray')
+CLOUD, POSES, YOLO = ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "yolo_msgs/msg/DetectionArray")
 P = 5
-FORMATS = {'i1': 1, 'u1': 2, 'i2': 3, 'u2': 4, 'i4': 5, 'u4': 6, 'f4': 7, 'f8': 8}
+FORMATS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
 def some_points(persons: int = 2) -> np.ndarray:
@@ -20,53 +19,81 @@ def some_points(persons: int = 2) -> np.ndarray:
     return np.arange(1, persons * P * 2 + 1, dtype=float).reshape(persons, P, 2)
 
 
-def cloud_of(make, columns: dict, formats: dict | None = None, order: str = '<', padding: int = 0,
-             row_padding: int = 0, offset: int = 0, **changes):
+def cloud_of(
+    make,
+    columns: dict,
+    formats: dict | None = None,
+    order: str = "<",
+    padding: int = 0,
+    row_padding: int = 0,
+    offset: int = 0,
+    **changes,
+):
     """A PointCloud2 of columns, each (height, width), with chosen types, byte order, padding and offsets."""
     formats = formats or {}
     height, width = next(iter(columns.values())).shape
-    forms = [formats.get(name, 'f4') for name in columns]
+    forms = [formats.get(name, "f4") for name in columns]
     sizes = [np.dtype(form).itemsize for form in forms]
     offsets = [offset + sum(sizes[:index]) for index in range(len(sizes))]
     step = offset + sum(sizes) + padding
     row_step = width * step + row_padding
     data = np.full(height * row_step, 0xEE, np.uint8)
-    dtype = np.dtype({'names': list(columns), 'formats': [order + form for form in forms], 'offsets': offsets,
-                      'itemsize': step})
+    dtype = np.dtype(
+        {"names": list(columns), "formats": [order + form for form in forms], "offsets": offsets, "itemsize": step}
+    )
     cloud = np.ndarray((height, width), dtype, data, strides=(row_step, step))
     for name, column in columns.items():
         cloud[name] = column
-    fields = [make('sensor_msgs/msg/PointField', name=name, offset=where, datatype=FORMATS[form], count=1)
-              for name, where, form in zip(columns, offsets, forms)]
-    message = dict(header=header_of(make), height=height, width=width, fields=fields,
-                   is_bigendian=order == '>', point_step=step, row_step=row_step, data=make.octets(data.tobytes()), is_dense=True)
+    fields = [
+        make("sensor_msgs/msg/PointField", name=name, offset=where, datatype=FORMATS[form], count=1)
+        for name, where, form in zip(columns, offsets, forms)
+    ]
+    message = dict(
+        header=header_of(make),
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=order == ">",
+        point_step=step,
+        row_step=row_step,
+        data=make.octets(data.tobytes()),
+        is_dense=True,
+    )
     return make(CLOUD, **{**message, **changes})
 
 
 def poses_of(make, xyz: np.ndarray):
-    orientation = make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
-    poses = [make('geometry_msgs/msg/Pose', orientation=orientation,
-                  position=make('geometry_msgs/msg/Point', x=x, y=y, z=z))
-             for x, y, z in xyz.reshape(-1, 3).tolist()]
+    orientation = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+    poses = [
+        make("geometry_msgs/msg/Pose", orientation=orientation, position=make("geometry_msgs/msg/Point", x=x, y=y, z=z))
+        for x, y, z in xyz.reshape(-1, 3).tolist()
+    ]
     return make(POSES, header=header_of(make), poses=poses)
 
 
 def detections_of(make, persons: list):
     """persons: (id, [(keypoint id, x, y, score), ...])."""
+
     def keypoint(number, x, y, score):
-        return make('yolo_msgs/msg/KeyPoint2D', id=number, score=score,
-                    point=make('yolo_msgs/msg/Point2D', x=x, y=y))
+        return make("yolo_msgs/msg/KeyPoint2D", id=number, score=score, point=make("yolo_msgs/msg/Point2D", x=x, y=y))
 
     def detection(name, keypoints):
         data = [keypoint(*values) for values in keypoints]
-        return make('yolo_msgs/msg/Detection', class_id=0, class_name='person', score=0.9, id=name,
-                    keypoints=make('yolo_msgs/msg/KeyPoint2DArray', data=data))
+        return make(
+            "yolo_msgs/msg/Detection",
+            class_id=0,
+            class_name="person",
+            score=0.9,
+            id=name,
+            keypoints=make("yolo_msgs/msg/KeyPoint2DArray", data=data),
+        )
+
     detections = [detection(*person) for person in persons]
     return make(YOLO, header=header_of(make), detections=detections)
 
 
 def xy_columns(xy: np.ndarray) -> dict:
-    return {'x': xy[..., 0], 'y': xy[..., 1]}
+    return {"x": xy[..., 0], "y": xy[..., 1]}
 
 
 def reason_of(type_name: str, msg) -> str:
@@ -78,36 +105,42 @@ def reason_of(type_name: str, msg) -> str:
 
 # --- PointCloud2: what must be read
 
+
 def test_cloud_round_trip(make):
     xy, confidence = some_points(), np.linspace(0.1, 1, 2 * P).reshape(2, P)
     xy[1, 2] = np.nan
-    got = read(CLOUD, outputs.keypoints_cloud(make, header_of(make), xy, confidence, ('12', '')), P)
+    got = read(CLOUD, outputs.keypoints_cloud(make, header_of(make), xy, confidence, ("12", "")), P)
     np.testing.assert_array_equal(got.xy, xy)
     np.testing.assert_array_equal(got.visible, ~np.isnan(xy[..., 0]))
     np.testing.assert_allclose(got.confidence, np.where(got.visible, confidence, 0), atol=1e-7)
-    assert got.ids == ('12', '')
-    assert (got.stamp, got.frame_id) == (7_000_000_005, 'camera_color_optical_frame')
+    assert got.ids == ("12", "")
+    assert (got.stamp, got.frame_id) == (7_000_000_005, "camera_color_optical_frame")
 
 
-@pytest.mark.parametrize('form', FORMATS)
-@pytest.mark.parametrize('order', '<>')
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("order", "<>")
 def test_cloud_in_every_number_type_and_byte_order(make, form, order):
-    msg = cloud_of(make, xy_columns(some_points()), {'x': form, 'y': form}, order)
+    msg = cloud_of(make, xy_columns(some_points()), {"x": form, "y": form}, order)
     got = read(CLOUD, msg, P)
     np.testing.assert_array_equal(got.xy, some_points())
     np.testing.assert_array_equal(got.confidence, 1)
-    assert got.ids == ('', '')
+    assert got.ids == ("", "")
 
 
 def test_cloud_with_padding_mixed_types_and_another_field_order(make):
     xy = some_points() + 0.25
-    columns = {'person_id': np.array([[3] * P, [-1] * P]), 'y': xy[..., 1],
-               'confidence': np.full((2, P), 0.5), 'label': np.zeros((2, P)), 'x': xy[..., 0]}
-    formats = {'person_id': 'i2', 'y': 'f8', 'confidence': 'f8', 'label': 'u1'}
+    columns = {
+        "person_id": np.array([[3] * P, [-1] * P]),
+        "y": xy[..., 1],
+        "confidence": np.full((2, P), 0.5),
+        "label": np.zeros((2, P)),
+        "x": xy[..., 0],
+    }
+    formats = {"person_id": "i2", "y": "f8", "confidence": "f8", "label": "u1"}
     got = read(CLOUD, cloud_of(make, columns, formats, padding=3, row_padding=11, offset=4), P)
     np.testing.assert_array_equal(got.xy, xy)
     np.testing.assert_array_equal(got.confidence, 0.5)
-    assert got.ids == ('3', '')
+    assert got.ids == ("3", "")
 
 
 def test_flat_cloud_is_split_into_persons(make):
@@ -117,18 +150,18 @@ def test_flat_cloud_is_split_into_persons(make):
 
 def test_cloud_person_id_survives_missing_points(make):
     ids = np.array([[np.nan, 16777216, np.nan, np.nan, np.nan]])
-    got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1)), 'person_id': ids}), P)
-    assert got.ids == ('16777216',)
+    got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1)), "person_id": ids}), P)
+    assert got.ids == ("16777216",)
 
 
-@pytest.mark.parametrize('size', [(0, 0), (0, P), (3, 0)])
+@pytest.mark.parametrize("size", [(0, 0), (0, P), (3, 0)])
 def test_empty_cloud_is_zero_persons(make, size):
     msg = cloud_of(make, xy_columns(np.empty((0, P, 2))), height=size[0], width=size[1], fields=[])
     got = read(CLOUD, msg, P)
     assert got.xy.shape == (0, P, 2) and got.visible.shape == (0, P) and got.ids == ()
 
 
-@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf, 1e7, -3e38])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e7, -3e38])
 def test_cloud_points_that_no_camera_saw_are_missing(make, value):
     xy = some_points()
     xy[0, 1, 1] = value
@@ -139,7 +172,7 @@ def test_cloud_points_that_no_camera_saw_are_missing(make, value):
 
 def test_cloud_confidence_nan_is_missing_and_others_are_clipped(make):
     confidence = np.array([[np.nan, 1.05, -0.5, 0.25, np.inf]])
-    got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1)), 'confidence': confidence}), P)
+    got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1)), "confidence": confidence}), P)
     np.testing.assert_array_equal(got.visible, [[False, True, True, True, False]])
     np.testing.assert_array_equal(got.confidence, [[0, 1, 0, 0.25, 0]])
 
@@ -147,7 +180,7 @@ def test_cloud_confidence_nan_is_missing_and_others_are_clipped(make):
 def test_reading_a_cloud_changes_nothing_in_it(make):
     xy = some_points()
     xy[0, 0] = np.inf
-    msg = cloud_of(make, xy_columns(xy), {'x': 'f8', 'y': 'f8'})
+    msg = cloud_of(make, xy_columns(xy), {"x": "f8", "y": "f8"})
     before = bytes(msg.data)
     read(CLOUD, msg, P)
     assert bytes(msg.data) == before
@@ -155,68 +188,81 @@ def test_reading_a_cloud_changes_nothing_in_it(make):
 
 # --- PointCloud2: what must be refused
 
+
 def test_cloud_with_other_field_names(make):
     xy = some_points()
-    assert reason_of(CLOUD, cloud_of(make, {'u': xy[..., 0], 'v': xy[..., 1]})) == 'wrong_fields'
+    assert reason_of(CLOUD, cloud_of(make, {"u": xy[..., 0], "v": xy[..., 1]})) == "wrong_fields"
 
 
 def test_cloud_without_fields(make):
-    assert reason_of(CLOUD, cloud_of(make, xy_columns(some_points()), fields=[])) == 'wrong_fields'
+    assert reason_of(CLOUD, cloud_of(make, xy_columns(some_points()), fields=[])) == "wrong_fields"
 
 
-@pytest.mark.parametrize('datatype, count', [(0, 1), (9, 1), (7, 2)])
+@pytest.mark.parametrize("datatype, count", [(0, 1), (9, 1), (7, 2)])
 def test_cloud_with_unknown_datatype_or_vector_field(make, datatype, count):
     msg = cloud_of(make, xy_columns(some_points()), padding=8)
-    msg.fields[1] = make('sensor_msgs/msg/PointField', name='y', offset=4, datatype=datatype, count=count)
-    assert reason_of(CLOUD, msg) == 'wrong_fields'
+    msg.fields[1] = make("sensor_msgs/msg/PointField", name="y", offset=4, datatype=datatype, count=count)
+    assert reason_of(CLOUD, msg) == "wrong_fields"
 
 
 def test_cloud_with_integer_confidence(make):
-    columns = {**xy_columns(some_points()), 'confidence': np.full((2, P), 87)}
-    assert reason_of(CLOUD, cloud_of(make, columns, {'confidence': 'u1'})) == 'wrong_fields'
+    columns = {**xy_columns(some_points()), "confidence": np.full((2, P), 87)}
+    assert reason_of(CLOUD, cloud_of(make, columns, {"confidence": "u1"})) == "wrong_fields"
 
 
 def test_cloud_of_3d_points(make):
     xy = some_points()
-    assert reason_of(CLOUD, cloud_of(make, {**xy_columns(xy), 'z': xy[..., 0]})) == 'not_2d'
+    assert reason_of(CLOUD, cloud_of(make, {**xy_columns(xy), "z": xy[..., 0]})) == "not_2d"
 
 
-@pytest.mark.parametrize('changes', [
-    {'point_step': 7}, {'point_step': 0}, {'row_step': 3}, {'row_step': 0},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"point_step": 7},
+        {"point_step": 0},
+        {"row_step": 3},
+        {"row_step": 0},
+    ],
+)
 def test_cloud_whose_steps_contradict_its_fields(make, changes):
-    assert reason_of(CLOUD, cloud_of(make, xy_columns(some_points()), **changes)) == 'wrong_steps'
+    assert reason_of(CLOUD, cloud_of(make, xy_columns(some_points()), **changes)) == "wrong_steps"
 
 
 def test_cloud_cut_short(make):
     msg = cloud_of(make, xy_columns(some_points()))
     msg.data = make.octets(bytes(msg.data)[:-1])
-    assert reason_of(CLOUD, msg) == 'truncated_data'
+    assert reason_of(CLOUD, msg) == "truncated_data"
 
 
-@pytest.mark.parametrize('changes', [
-    {'height': 2 ** 32 - 1}, {'height': 1, 'width': 2 ** 32 - 1}, {'height': 1, 'point_step': 2 ** 32 - 1},
-    {'row_step': 2 ** 32 - 1},
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"height": 2**32 - 1},
+        {"height": 1, "width": 2**32 - 1},
+        {"height": 1, "point_step": 2**32 - 1},
+        {"row_step": 2**32 - 1},
+    ],
+)
 def test_cloud_of_absurd_size(make, changes):
-    assert reason_of(CLOUD, cloud_of(make, xy_columns(some_points()), **changes)) == 'truncated_data'
+    assert reason_of(CLOUD, cloud_of(make, xy_columns(some_points()), **changes)) == "truncated_data"
 
 
-@pytest.mark.parametrize('shape, fitting', [((2, 4), {4}), ((1, 12), {3, 4, 6}), ((3, 6), {6})])
+@pytest.mark.parametrize("shape, fitting", [((2, 4), {4}), ((1, 12), {3, 4, 6}), ((3, 6), {6})])
 def test_cloud_with_another_number_of_points_says_which_would_fit(make, shape, fitting):
     with pytest.raises(WrongPointCount) as error:
-        read(CLOUD, cloud_of(make, {'x': np.ones(shape), 'y': np.ones(shape)}), P)
+        read(CLOUD, cloud_of(make, {"x": np.ones(shape), "y": np.ones(shape)}), P)
     assert {points for points in (3, 4, 5, 6, 7) if error.value.fits(points)} == fitting
 
 
 # --- PoseArray
+
 
 def test_pose_array_of_two_persons_with_confidence(make):
     confidence = np.linspace(0, 0.9, 2 * P).reshape(2, P, 1)
     got = read(POSES, poses_of(make, np.concatenate([some_points(), confidence], axis=-1)), P)
     np.testing.assert_array_equal(got.xy, some_points())
     np.testing.assert_allclose(got.confidence, confidence[..., 0])
-    assert got.visible.all() and got.ids == ('', '')
+    assert got.visible.all() and got.ids == ("", "")
 
 
 def test_pose_array_without_confidence_or_with_missing_points(make):
@@ -231,64 +277,73 @@ def test_pose_array_of_nobody(make):
     assert read(POSES, poses_of(make, np.empty((0, 3))), P).xy.shape == (0, P, 2)
 
 
-@pytest.mark.parametrize('z', [1.7, -0.2, np.inf])
+@pytest.mark.parametrize("z", [1.7, -0.2, np.inf])
 def test_pose_array_that_is_3d(make, z):
     xyz = np.concatenate([some_points(), np.zeros((2, P, 1))], axis=-1)
     xyz[1, 3, 2] = z
-    assert reason_of(POSES, poses_of(make, xyz)) == 'not_2d'
+    assert reason_of(POSES, poses_of(make, xyz)) == "not_2d"
 
 
 def test_pose_array_with_another_number_of_points(make):
-    assert reason_of(POSES, poses_of(make, np.zeros((P + 1, 3)))) == 'wrong_point_count'
+    assert reason_of(POSES, poses_of(make, np.zeros((P + 1, 3)))) == "wrong_point_count"
 
 
 # --- yolo_msgs, which only rosbags' typestore knows here
 
+
 def test_yolo_places_points_by_their_one_based_id(bag_make):
-    msg = bag_make.through_cdr(detections_of(bag_make, [
-        ('4', [(5, 50.0, 51.0, 0.5), (1, 10.0, 11.0, 0.9), (2, 0.0, 0.0, 0.8)]),
-        ('', [(3, 30.0, 0.0, 0.7)]),
-    ]))
+    msg = bag_make.through_cdr(
+        detections_of(
+            bag_make,
+            [
+                ("4", [(5, 50.0, 51.0, 0.5), (1, 10.0, 11.0, 0.9), (2, 0.0, 0.0, 0.8)]),
+                ("", [(3, 30.0, 0.0, 0.7)]),
+            ],
+        )
+    )
     got = read(YOLO, msg, P)
-    np.testing.assert_array_equal(got.visible, [[True, False, False, False, True],
-                                                [False, False, True, False, False]])
+    np.testing.assert_array_equal(got.visible, [[True, False, False, False, True], [False, False, True, False, False]])
     np.testing.assert_array_equal(got.xy[0, [0, 4]], [[10, 11], [50, 51]])
     np.testing.assert_array_equal(got.xy[1, 2], [30, 0])
     np.testing.assert_array_equal(got.confidence, [[0.9, 0, 0, 0, 0.5], [0, 0, 0.7, 0, 0]])
-    assert got.ids == ('4', '')
+    assert got.ids == ("4", "")
 
 
 def test_yolo_person_without_keypoints_and_nobody(bag_make):
-    assert not read(YOLO, detections_of(bag_make, [('1', [])]), P).visible.any()
+    assert not read(YOLO, detections_of(bag_make, [("1", [])]), P).visible.any()
     assert read(YOLO, detections_of(bag_make, []), P).xy.shape == (0, P, 2)
 
 
-@pytest.mark.parametrize('keypoint, reason', [(0, 'wrong_keypoint_id'), (-1, 'wrong_keypoint_id'),
-                                              (P + 1, 'wrong_point_count')])
+@pytest.mark.parametrize(
+    "keypoint, reason", [(0, "wrong_keypoint_id"), (-1, "wrong_keypoint_id"), (P + 1, "wrong_point_count")]
+)
 def test_yolo_with_ids_outside_the_layout(bag_make, keypoint, reason):
-    assert reason_of(YOLO, detections_of(bag_make, [('', [(keypoint, 1.0, 1.0, 1.0)])])) == reason
+    assert reason_of(YOLO, detections_of(bag_make, [("", [(keypoint, 1.0, 1.0, 1.0)])])) == reason
 
 
 def test_unknown_type(make):
-    assert reason_of('vision_msgs/msg/Detection2DArray', header_of(make)) == 'unknown_type'
+    assert reason_of("vision_msgs/msg/Detection2DArray", header_of(make)) == "unknown_type"
 
 
 # --- CameraInfo
+
 
 def test_camera_info(make):
     got = read_camera_info(camera_info(make, fy=610.0))
     assert (got.fx, got.fy, got.cx, got.cy, got.width, got.height) == (600, 610, 320, 240, 640, 480)
 
 
-@pytest.mark.parametrize('wrong', [{'fx': 0.0, 'fy': 0.0}, {'fx': np.nan}, {'fy': -600.0}, {'fy': np.inf},
-                                   {'cx': np.nan}])
+@pytest.mark.parametrize(
+    "wrong", [{"fx": 0.0, "fy": 0.0}, {"fx": np.nan}, {"fy": -600.0}, {"fy": np.inf}, {"cx": np.nan}]
+)
 def test_camera_info_that_is_no_camera(make, wrong):
     with pytest.raises(MessageError) as error:
         read_camera_info(camera_info(make, **wrong))
-    assert error.value.reason == 'bad_intrinsics'
+    assert error.value.reason == "bad_intrinsics"
 
 
 # --- writers
+
 
 def written(make, bag_make, msg):
     """As a bag gives it back, where the message is rosbags'; rclpy's has had its fields checked already."""
@@ -303,18 +358,18 @@ def test_pose_array_writer(make, bag_make):
     msg = written(make, bag_make, msg)
     got = [(p.position.x, p.position.y, p.position.z) for p in msg.poses]
     np.testing.assert_array_equal(got, points.reshape(-1, 3))
-    assert {(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in msg.poses} == {
-        (0, 0, 0, 1)}
+    assert {(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in msg.poses} == {(0, 0, 0, 1)}
 
 
 def test_points_cloud_writer(make, bag_make):
     points = np.random.default_rng(2).normal(size=(3, P, 3)).astype(np.float32)
     confidence = np.full((3, P), 0.5)
-    msg = written(make, bag_make, outputs.points_cloud(make, header_of(make), points, confidence,
-                                                       ('7', 'anna', '99999999999')))
+    msg = written(
+        make, bag_make, outputs.points_cloud(make, header_of(make), points, confidence, ("7", "anna", "99999999999"))
+    )
     assert (msg.height, msg.width, msg.point_step, msg.row_step) == (3, P, 24, 24 * P)
-    assert [field.name for field in msg.fields] == ['x', 'y', 'z', 'confidence', 'keypoint', 'person_id']
-    data = np.frombuffer(msg.data, '<f4').reshape(3, P, 6)
+    assert [field.name for field in msg.fields] == ["x", "y", "z", "confidence", "keypoint", "person_id"]
+    data = np.frombuffer(msg.data, "<f4").reshape(3, P, 6)
     np.testing.assert_array_equal(data[..., :3], points)
     np.testing.assert_array_equal(data[..., 3], 0.5)
     np.testing.assert_array_equal(data[..., 4], np.tile(np.arange(P), (3, 1)))
@@ -325,8 +380,13 @@ def test_points_cloud_writer(make, bag_make):
 def test_markers_are_two_packed_lists_with_sides_and_hidden_points(make, bag_make):
     points = np.random.default_rng(3).normal(size=(2, 3, 3))
     observed = np.array([[True, True, True], [True, False, True]])
-    msg = written(make, bag_make, outputs.skeleton_markers(
-        make, header_of(make), points, observed, [(0, 1), (0, 2)], ('', 'left', 'right'), 0.02))
+    msg = written(
+        make,
+        bag_make,
+        outputs.skeleton_markers(
+            make, header_of(make), points, observed, [(0, 1), (0, 2)], ("", "left", "right"), 0.02
+        ),
+    )
     bones, spheres = msg.markers
     assert (bones.type, spheres.type) == (bones.LINE_LIST, bones.SPHERE_LIST)
     assert (bones.ns, bones.id) != (spheres.ns, spheres.id)
@@ -347,6 +407,7 @@ def test_nobody_is_written_as_empty_messages(make, bag_make):
     assert len(written(make, bag_make, outputs.pose_array(make, header_of(make), nobody)).poses) == 0
     cloud = written(make, bag_make, outputs.points_cloud(make, header_of(make), nobody, nothing, ()))
     assert (cloud.height, cloud.width, len(cloud.data)) == (0, P, 0)
-    markers = written(make, bag_make, outputs.skeleton_markers(
-        make, header_of(make), nobody, nothing > 0, [(0, 1)], ('',) * P, 0.02)).markers
+    markers = written(
+        make, bag_make, outputs.skeleton_markers(make, header_of(make), nobody, nothing > 0, [(0, 1)], ("",) * P, 0.02)
+    ).markers
     assert all(marker.action == marker.DELETE and len(marker.points) == 0 for marker in markers)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who may know whom: the rooms of the house import in one direction, and the robot's need nothing heavy."""
+
 from __future__ import annotations
 
 import ast
@@ -16,8 +17,16 @@ ROOMS = ("msg_adapters", "paul_ros", "training")
 #: What each room may import of the others.
 ALLOWED = {"msg_adapters": set(), "paul_ros": {"msg_adapters"}, "training": {"msg_adapters", "paul_ros"}}
 ROS = {
-    "rclpy", "rcl_interfaces", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "sensor_msgs",
-    "std_msgs", "visualization_msgs", "yolo_msgs", "ament_index_python",
+    "rclpy",
+    "rcl_interfaces",
+    "builtin_interfaces",
+    "diagnostic_msgs",
+    "geometry_msgs",
+    "sensor_msgs",
+    "std_msgs",
+    "visualization_msgs",
+    "yolo_msgs",
+    "ament_index_python",
 }
 #: On every robot; all else is imported where it is needed, by those who asked for a bag or a picture.
 ROBOT = {"numpy", "yaml"}
@@ -49,9 +58,7 @@ def _imports(node: ast.AST, file: Path, lazy: bool) -> Iterator[Import]:
 
 
 def run(code: str, *arguments: str, python: str | Path = sys.executable) -> str:
-    answer = subprocess.run(
-        [python, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    answer = subprocess.run([python, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert answer.returncode == 0, answer.stderr
     return answer.stdout
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags: what is written reads back; what is damaged gives all that lies before the damage, then one clear error."""
+
 from __future__ import annotations
 
 import shutil
@@ -12,36 +13,41 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
 
-POSES = 'geometry_msgs/msg/PoseArray'
+POSES = "geometry_msgs/msg/PoseArray"
 TICK = 33_333_333
 
 
 def header(make, number):
-    stamp = make('builtin_interfaces/msg/Time', sec=number, nanosec=7)
-    return make('std_msgs/msg/Header', stamp=stamp, frame_id='camera')
+    stamp = make("builtin_interfaces/msg/Time", sec=number, nanosec=7)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
 
 
 def poses(make, number, count=40):
-    turn = make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
+    turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
     places = np.random.default_rng(number).normal(size=(count, 3)).tolist()
-    return make(POSES, header=header(make, number), poses=[
-        make('geometry_msgs/msg/Pose', position=make('geometry_msgs/msg/Point', x=x, y=y, z=z), orientation=turn)
-        for x, y, z in places])
+    return make(
+        POSES,
+        header=header(make, number),
+        poses=[
+            make("geometry_msgs/msg/Pose", position=make("geometry_msgs/msg/Point", x=x, y=y, z=z), orientation=turn)
+            for x, y, z in places
+        ],
+    )
 
 
-def write(path, count=100, compression='zstd'):
+def write(path, count=100, compression="zstd"):
     make = BagMessages()
     with BagWriter(path, make, compression) as bag:
         for number in range(count):
-            bag.write('/poses', poses(make, number), number * TICK)
-            bag.write('/words', make('std_msgs/msg/String', data=f'frame {number} äöü'), number * TICK + 1)
+            bag.write("/poses", poses(make, number), number * TICK)
+            bag.write("/words", make("std_msgs/msg/String", data=f"frame {number} äöü"), number * TICK + 1)
     return path
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     """Several chunks: 200 messages."""
-    return write(tmp_path_factory.mktemp('bag') / 'whole.mcap')
+    return write(tmp_path_factory.mktemp("bag") / "whole.mcap")
 
 
 def read_until_damage(path):
@@ -55,26 +61,26 @@ def read_until_damage(path):
     return found, None
 
 
-@pytest.mark.parametrize('compression', ['zstd', 'lz4', 'none'])
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
 def test_round_trip(tmp_path, compression):
     make = BagMessages()
-    found = list(read_messages(write(tmp_path / 'a.mcap', 30, compression)))
+    found = list(read_messages(write(tmp_path / "a.mcap", 30, compression)))
     assert len(found) == 60
     for number, (topic, kind, message, time) in enumerate(found[::2]):
-        assert (topic, kind, time) == ('/poses', POSES, number * TICK)
-        assert message.header.frame_id == 'camera' and message.header.stamp.sec == number
+        assert (topic, kind, time) == ("/poses", POSES, number * TICK)
+        assert message.header.frame_id == "camera" and message.header.stamp.sec == number
         expected = [(p.position.x, p.position.y, p.position.z) for p in poses(make, number).poses]
         assert [(p.position.x, p.position.y, p.position.z) for p in message.poses] == expected
-    assert found[5][2].data == 'frame 2 äöü'
-    assert topics_of(tmp_path / 'a.mcap') == {'/poses': (POSES, 30), '/words': ('std_msgs/msg/String', 30)}
+    assert found[5][2].data == "frame 2 äöü"
+    assert topics_of(tmp_path / "a.mcap") == {"/poses": (POSES, 30), "/words": ("std_msgs/msg/String", 30)}
 
 
 def test_only_the_topics_asked_for(bag):
-    assert {topic for topic, *_ in read_messages(bag, ['/words'])} == {'/words'}
+    assert {topic for topic, *_ in read_messages(bag, ["/words"])} == {"/words"}
 
 
 def test_equal_input_gives_equal_bytes(tmp_path):
-    assert write(tmp_path / 'a.mcap').read_bytes() == write(tmp_path / 'b.mcap').read_bytes()
+    assert write(tmp_path / "a.mcap").read_bytes() == write(tmp_path / "b.mcap").read_bytes()
 
 
 def test_rosbags_reads_what_is_written(bag):
@@ -82,25 +88,25 @@ def test_rosbags_reads_what_is_written(bag):
     with AnyReader([bag]) as reader:
         assert reader.message_count == 200
         found = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
-    assert found[1].data == 'frame 0 äöü' and found[198].header.stamp.sec == 99
+    assert found[1].data == "frame 0 äöü" and found[198].header.stamp.sec == 99
 
 
 def test_a_record_is_copied_as_it_is(bag, tmp_path):
-    with BagWriter(tmp_path / 'copy.mcap') as copy:
+    with BagWriter(tmp_path / "copy.mcap") as copy:
         for record in read_records(bag):
             copy.write_record(record)
-    assert (tmp_path / 'copy.mcap').read_bytes() == bag.read_bytes()
+    assert (tmp_path / "copy.mcap").read_bytes() == bag.read_bytes()
 
 
 def test_cut_anywhere_gives_what_was_whole(bag, tmp_path):
     """Never more, never other messages, never another kind of error; half a file gives about half of them."""
     whole = bag.read_bytes()
-    cut, counts = tmp_path / 'cut.mcap', []
+    cut, counts = tmp_path / "cut.mcap", []
     for size in [*np.linspace(9, len(whole) - 1, 60).astype(int), len(whole) - 1, len(whole) - 8]:
         cut.write_bytes(whole[:size])
         found, error = read_until_damage(cut)
         assert error is not None and error.messages_read == len(found)
-        assert 'mcap recover cut.mcap' in str(error) and '\n' not in str(error)
+        assert "mcap recover cut.mcap" in str(error) and "\n" not in str(error)
         assert [time for *_, time in found] == [n // 2 * TICK + n % 2 for n in range(len(found))]
         counts.append(len(found))
     assert counts[-1] == 200 and counts == sorted(counts[:-2]) + counts[-2:]
@@ -109,117 +115,123 @@ def test_cut_anywhere_gives_what_was_whole(bag, tmp_path):
 
 def test_any_changed_byte_is_noticed(bag, tmp_path):
     whole, rng = bag.read_bytes(), np.random.default_rng(1)
-    bad = tmp_path / 'bad.mcap'
+    bad = tmp_path / "bad.mcap"
     expected = [time for *_, time in read_messages(bag)]
     for place in [0, 8, 9, len(whole) - 1, len(whole) - 12, *rng.integers(0, len(whole), 150).tolist()]:
         changed = bytearray(whole)
         changed[place] ^= 1 << int(rng.integers(8))
         bad.write_bytes(changed)
         found, error = read_until_damage(bad)
-        assert error is not None, f'byte {place}'
-        assert [time for *_, time in found] == expected[:len(found)]
+        assert error is not None, f"byte {place}"
+        assert [time for *_, time in found] == expected[: len(found)]
 
 
-@pytest.mark.parametrize('content, clue', [
-    (b'', 'empty'),
-    (b'SQLite format 3\0' + bytes(100), 'not an mcap file'),
-    (b'\x89MCAP0\r\n', 'ends too early'),
-    (b'\x89MC', 'not an mcap file'),
-])
+@pytest.mark.parametrize(
+    "content, clue",
+    [
+        (b"", "empty"),
+        (b"SQLite format 3\0" + bytes(100), "not an mcap file"),
+        (b"\x89MCAP0\r\n", "ends too early"),
+        (b"\x89MC", "not an mcap file"),
+    ],
+)
 def test_what_is_no_bag(tmp_path, content, clue):
-    path = tmp_path / 'odd.mcap'
+    path = tmp_path / "odd.mcap"
     path.write_bytes(content)
     found, error = read_until_damage(path)
     assert not found and clue in str(error) and str(path) in str(error)
 
 
 def test_missing_bag(tmp_path):
-    with pytest.raises(BagError, match='no such bag'):
-        list(read_messages(tmp_path / 'nowhere.mcap'))
+    with pytest.raises(BagError, match="no such bag"):
+        list(read_messages(tmp_path / "nowhere.mcap"))
 
 
 def test_folder_without_mcap(tmp_path):
-    (tmp_path / 'old.db3').write_bytes(b'')
-    with pytest.raises(BagError, match='ros2 bag convert'):
+    (tmp_path / "old.db3").write_bytes(b"")
+    with pytest.raises(BagError, match="ros2 bag convert"):
         list(read_messages(tmp_path))
 
 
 def test_rosbag2_folder_of_several_files(tmp_path, bag):
     """As a recorder splits them: metadata.yaml tells the order, not the names."""
-    shutil.copy(bag, tmp_path / 'z.mcap')
-    write(tmp_path / 'a.mcap', 3)
+    shutil.copy(bag, tmp_path / "z.mcap")
+    write(tmp_path / "a.mcap", 3)
     assert len(list(read_messages(tmp_path))) == 206
-    (tmp_path / 'metadata.yaml').write_text(
-        'rosbag2_bagfile_information:\n  relative_file_paths:\n  - z.mcap\n  - a.mcap\n')
+    (tmp_path / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  relative_file_paths:\n  - z.mcap\n  - a.mcap\n"
+    )
     assert [time for *_, time in read_messages(tmp_path)][-6:] == [n // 2 * TICK + n % 2 for n in range(6)]
-    (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  rela')
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  rela")
     assert len(list(read_messages(tmp_path))) == 206
 
 
 def test_bag_of_another_writer_with_a_type_nobody_installed(tmp_path):
     """The definition embedded in the bag is all that is needed."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    definitions = {'odd_msgs/msg/Inner': 'float32[3] xyz\n',
-                   'odd_msgs/msg/Outer': 'odd_msgs/Inner[] parts\nstring name\n'}
+    definitions = {
+        "odd_msgs/msg/Inner": "float32[3] xyz\n",
+        "odd_msgs/msg/Outer": "odd_msgs/Inner[] parts\nstring name\n",
+    }
     make = BagMessages(definitions)
     for name, text in definitions.items():
         store.register(get_types_from_msg(text, name))
-    inner = make('odd_msgs/msg/Inner', xyz=np.array([1, 2, 3], np.float32))
-    outer = make('odd_msgs/msg/Outer', parts=[inner, inner], name='x')
-    with Writer(tmp_path / 'foreign', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection('/odd', 'odd_msgs/msg/Outer', typestore=store)
-        writer.write(connection, 5, store.serialize_cdr(outer, 'odd_msgs/msg/Outer'))
-    [(topic, kind, message, time)] = read_messages(tmp_path / 'foreign')
-    assert (topic, kind, time, message.name) == ('/odd', 'odd_msgs/msg/Outer', 5, 'x')
+    inner = make("odd_msgs/msg/Inner", xyz=np.array([1, 2, 3], np.float32))
+    outer = make("odd_msgs/msg/Outer", parts=[inner, inner], name="x")
+    with Writer(tmp_path / "foreign", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/odd", "odd_msgs/msg/Outer", typestore=store)
+        writer.write(connection, 5, store.serialize_cdr(outer, "odd_msgs/msg/Outer"))
+    [(topic, kind, message, time)] = read_messages(tmp_path / "foreign")
+    assert (topic, kind, time, message.name) == ("/odd", "odd_msgs/msg/Outer", 5, "x")
     assert message.parts[1].xyz.tolist() == [1, 2, 3]
 
-    with BagWriter(tmp_path / 'own.mcap', make) as bag:
-        bag.write('/odd', outer, 6)
-    assert next(read_messages(tmp_path / 'own.mcap'))[2].parts[0].xyz.tolist() == [1, 2, 3]
+    with BagWriter(tmp_path / "own.mcap", make) as bag:
+        bag.write("/odd", outer, 6)
+    assert next(read_messages(tmp_path / "own.mcap"))[2].parts[0].xyz.tolist() == [1, 2, 3]
 
 
 def test_one_name_with_two_definitions(tmp_path):
     """Two bags from two versions of a package, read one after the other."""
-    for field in ('int32 a\n', 'string b\n'):
-        make = BagMessages({'odd_msgs/msg/Thing': field})
-        value = {'a': 3} if 'a' in field else {'b': 'three'}
-        with BagWriter(tmp_path / 'x.mcap', make) as bag:
-            bag.write('/thing', make('odd_msgs/msg/Thing', **value), 1)
-        [(_, _, message, _)] = read_messages(tmp_path / 'x.mcap')
+    for field in ("int32 a\n", "string b\n"):
+        make = BagMessages({"odd_msgs/msg/Thing": field})
+        value = {"a": 3} if "a" in field else {"b": "three"}
+        with BagWriter(tmp_path / "x.mcap", make) as bag:
+            bag.write("/thing", make("odd_msgs/msg/Thing", **value), 1)
+        [(_, _, message, _)] = read_messages(tmp_path / "x.mcap")
         assert {name: getattr(message, name) for name in value} == value
 
 
 def test_bytes_that_do_not_fit_their_definition(tmp_path):
-    with BagWriter(tmp_path / 'x.mcap') as bag:
-        bag.write_cdr('/poses', POSES, b'\x00\x01\x00\x00\x01\x02', 1)
-    with pytest.raises(BagError, match='does not decode'):
-        list(read_messages(tmp_path / 'x.mcap'))
+    with BagWriter(tmp_path / "x.mcap") as bag:
+        bag.write_cdr("/poses", POSES, b"\x00\x01\x00\x00\x01\x02", 1)
+    with pytest.raises(BagError, match="does not decode"):
+        list(read_messages(tmp_path / "x.mcap"))
 
 
 def test_failure_leaves_the_old_file_and_a_readable_part(tmp_path):
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(b'precious')
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
     make = BagMessages()
     with pytest.raises(RuntimeError):
         with BagWriter(path, make) as bag:
-            bag.write('/poses', poses(make, 0), 0)
+            bag.write("/poses", poses(make, 0), 0)
             raise RuntimeError
-    assert path.read_bytes() == b'precious'
-    assert len(list(read_messages(tmp_path / 'a.mcap.part'))) == 1
+    assert path.read_bytes() == b"precious"
+    assert len(list(read_messages(tmp_path / "a.mcap.part"))) == 1
 
 
 def test_failure_before_the_first_message_leaves_nothing(tmp_path):
     with pytest.raises(RuntimeError):
-        with BagWriter(tmp_path / 'a.mcap'):
+        with BagWriter(tmp_path / "a.mcap"):
             raise RuntimeError
     assert not list(tmp_path.iterdir())
 
 
 def test_killed_recorder_leaves_all_but_the_last_chunk(tmp_path):
     make = BagMessages()
-    bag = BagWriter(tmp_path / 'a.mcap', make).__enter__()
+    bag = BagWriter(tmp_path / "a.mcap", make).__enter__()
     for number in range(300):
-        bag.write('/poses', poses(make, number), number)
+        bag.write("/poses", poses(make, number), number)
     found, error = read_until_damage(bag.part)  # the file as a kill -9 would leave it now, less what the OS still holds
     bag._file.close()
     assert error is not None

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shipped recordings: remade bit for bit, small, and what their README says they are."""
+
 from __future__ import annotations
 
 import subprocess
@@ -14,20 +15,20 @@ from msg_adapters.keypoints import stamp_ns
 from paul_ros.bag import read_messages, topics_of
 from training.mocap import CMU31, coco17_from_cmu31
 
-BAGS = Path(__file__).resolve().parent.parent / 'bags'
-NAMES = {'one_person.mcap': 559, 'two_persons_crossing.mcap': 390}
-CLOUD = 'sensor_msgs/msg/PointCloud2'
+BAGS = Path(__file__).resolve().parent.parent / "bags"
+NAMES = {"one_person.mcap": 585, "two_persons_crossing.mcap": 390}
+CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
-@pytest.fixture(scope='module', params=NAMES)
+@pytest.fixture(scope="module", params=NAMES)
 def recording(request):
     """(name, [(Keypoints2D, truth (N,17,3))], Intrinsics) of a bag."""
     frames, truths, camera = {}, {}, None
     for topic, kind, message, time in read_messages(BAGS / request.param):
-        assert time == stamp_ns(message.header) and message.header.frame_id == 'camera_color_optical_frame'
-        if topic == '/keypoints':
+        assert time == stamp_ns(message.header) and message.header.frame_id == "camera_color_optical_frame"
+        if topic == "/keypoints":
             frames[time] = msg_adapters.read(kind, message, 17)
-        elif topic == '/camera_info':
+        elif topic == "/camera_info":
             camera = msg_adapters.read_camera_info(message)
         else:
             flat = [(p.position.x, p.position.y, p.position.z) for p in message.poses]
@@ -37,22 +38,22 @@ def recording(request):
 
 
 def test_made_anew_bit_for_bit(tmp_path):
-    subprocess.run([sys.executable, BAGS / 'make_bags.py', tmp_path], check=True, capture_output=True, cwd=tmp_path)
+    subprocess.run([sys.executable, BAGS / "make_bags.py", tmp_path], check=True, capture_output=True, cwd=tmp_path)
     for name in NAMES:
         assert (tmp_path / name).read_bytes() == (BAGS / name).read_bytes()
 
 
 def test_sizes():
     assert all((BAGS / name).stat().st_size <= 2_000_000 for name in NAMES)
-    assert sum(clip.stat().st_size for clip in (BAGS / 'source').iterdir()) < 1_500_000
+    assert sum(clip.stat().st_size for clip in (BAGS / "source").iterdir()) < 1_500_000
 
 
-@pytest.mark.parametrize('name, frames', NAMES.items())
+@pytest.mark.parametrize("name, frames", NAMES.items())
 def test_topics(name, frames):
     assert topics_of(BAGS / name) == {
-        '/camera_info': ('sensor_msgs/msg/CameraInfo', frames),
-        '/keypoints': (CLOUD, frames),
-        '/ground_truth/poses': ('geometry_msgs/msg/PoseArray', frames),
+        "/camera_info": ("sensor_msgs/msg/CameraInfo", frames),
+        "/keypoints": (CLOUD, frames),
+        "/ground_truth/poses": ("geometry_msgs/msg/PoseArray", frames),
     }
 
 
@@ -72,7 +73,7 @@ def test_truth_belongs_to_its_row(recording):
         xy = truth[..., :2] / truth[..., 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
         offsets.append((keypoints.xy - xy)[keypoints.visible])
     offsets = np.concatenate(offsets)
-    if name == 'one_person.mcap':
+    if name == "one_person.mcap":
         assert np.abs(offsets).max() < 1e-4
     else:
         assert 2 < offsets.std() < 3 and np.abs(offsets).max() < 16
@@ -94,26 +95,28 @@ def test_left_is_left(recording):
     across = truth[:, 3] - truth[:, 4]
     up = truth[:, 1:3].mean(1) - truth[:, 0]
     nose = truth[:, 0] - truth[:, 3:5].mean(1)
-    assert (np.einsum('ni,ni->n', np.cross(across, up), nose) > 0).all()
+    assert (np.einsum("ni,ni->n", np.cross(across, up), nose) > 0).all()
 
 
 def test_one_person_is_always_seen_whole(recording):
     name, frames, camera = recording
-    if name != 'one_person.mcap':
+    if name != "one_person.mcap":
         return
-    assert all(keypoints.ids == ('1',) and keypoints.visible.all() for keypoints, _ in frames)
+    assert all(keypoints.ids == ("1",) and keypoints.visible.all() for keypoints, _ in frames)
     xy = np.concatenate([keypoints.xy for keypoints, _ in frames])
     assert (xy > 0).all() and (xy < [camera.width, camera.height]).all()
 
 
 def test_two_persons_cross_hide_and_leave():
-    frames = [msg_adapters.read(kind, message, 17)
-              for _, kind, message, _ in read_messages(BAGS / 'two_persons_crossing.mcap', ['/keypoints'])]
+    frames = [
+        msg_adapters.read(kind, message, 17)
+        for _, kind, message, _ in read_messages(BAGS / "two_persons_crossing.mcap", ["/keypoints"])
+    ]
     ids = [frame.ids for frame in frames]
-    assert set(ids) == {(), ('3',), ('7',), ('7', '3'), ('3', '7')}
+    assert set(ids) == {(), ("3",), ("7",), ("7", "3"), ("3", "7")}
     assert ids[0] == ids[-1] == () and ids.count(()) > 30
     both = [dict(zip(frame.ids, np.nanmean(frame.xy[..., 0], axis=1))) for frame in frames if len(frame.ids) == 2]
-    side = np.sign([place['3'] - place['7'] for place in both])
+    side = np.sign([place["3"] - place["7"] for place in both])
     assert (side[:20] == -1).all() and (side == 1).sum() > 30 and (side[-20:] == -1).all()
     visible = np.concatenate([frame.visible for frame in frames])
     assert 0.05 < 1 - visible.mean() < 0.3
@@ -124,13 +127,19 @@ def test_two_persons_cross_hide_and_leave():
 def test_coco_points_of_a_plain_pose():
     """A T-pose made by hand: y up, facing +z, so left is +x."""
     joints = np.zeros((1, len(CMU31), 3))
-    places = {'upperneck': (0, 1.5, 0), 'head': (0, 1.7, 0), 'lclavicle': (0.2, 1.4, 0),
-              'rclavicle': (-0.2, 1.4, 0), 'lradius': (0.8, 1.4, 0), 'rtibia': (-0.1, 0.1, 0)}
+    places = {
+        "upperneck": (0, 1.5, 0),
+        "head": (0, 1.7, 0),
+        "lclavicle": (0.2, 1.4, 0),
+        "rclavicle": (-0.2, 1.4, 0),
+        "lradius": (0.8, 1.4, 0),
+        "rtibia": (-0.1, 0.1, 0),
+    }
     for name, place in places.items():
         joints[0, CMU31.index(name)] = place
     points = coco17_from_cmu31(joints)[0]
     assert np.allclose(points[0], (0, 1.6, 0.11)) and np.allclose(points[1], (0.032, 1.64, 0.085))
     assert np.allclose(points[4], (-0.075, 1.62, 0))
     assert np.allclose(points[9], (0.8, 1.4, 0)) and np.allclose(points[16], (-0.1, 0.1, 0))
-    with pytest.raises(ValueError, match='31'):
+    with pytest.raises(ValueError, match="31"):
         coco17_from_cmu31(joints[:, :17])

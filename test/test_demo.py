@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo's parts on two seconds of a bag: the live node and the replay give the same, stamp by stamp."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -12,34 +13,34 @@ from paul_ros.demo import BAGS, DemoError, compare, find_bag, run_live
 from paul_ros.replay import open_stream, replay
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def two_seconds(tmp_path_factory):
     """Of the crossing, from the first empty frames on until both are seen; without its truth."""
-    path = tmp_path_factory.mktemp('demo') / 'short.mcap'
+    path = tmp_path_factory.mktemp("demo") / "short.mcap"
     with BagWriter(path) as writer:
-        for record in list(read_records(find_bag('two_persons_crossing'), ['/camera_info', '/keypoints']))[40:160]:
+        for record in list(read_records(find_bag("two_persons_crossing"), ["/camera_info", "/keypoints"]))[40:160]:
             writer.write_record(record)
     return path
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def lived(two_seconds, model_file, tmp_path_factory):
-    recording = tmp_path_factory.mktemp('demo') / 'lifted.mcap'
+    recording = tmp_path_factory.mktemp("demo") / "lifted.mcap"
     return run_live(two_seconds, recording, str(model_file))
 
 
 def test_live_equals_replay(lived, two_seconds, model_file):
     done, agreement = compare(replay(two_seconds, open_stream(model_file)), lived.recording)
-    assert agreement.pop('max_difference_relative') <= 1e-6
-    assert agreement == {'frames_lost': 0, 'frames_unknown': 0, 'frames_with_other_persons': 0, 'order_kept': True}
+    assert agreement.pop("max_difference_relative") <= 1e-6
+    assert agreement == {"frames_lost": 0, "frames_unknown": 0, "frames_with_other_persons": 0, "order_kept": True}
     assert lived.sent == lived.received == len(done.frames) == 60
     assert sum(frame.lifted.ok.sum() for frame in done.frames) > 20
 
 
 def test_everything_is_recorded(lived):
     counts = {topic: count for topic, (_, count) in topics_of(lived.recording).items()}
-    assert {'/keypoints', '/camera_info', '/lifter/layout', '/diagnostics'} <= set(counts)
-    assert counts['/lifter/poses'] == counts['/lifter/keypoints3d'] == counts['/lifter/markers'] == 60
+    assert {"/keypoints", "/camera_info", "/lifter/layout", "/diagnostics"} <= set(counts)
+    assert counts["/lifter/poses"] == counts["/lifter/keypoints3d"] == counts["/lifter/markers"] == 60
 
 
 def test_figures_of_the_node(lived):
@@ -48,44 +49,47 @@ def test_figures_of_the_node(lived):
     assert 0 < lived.lift_us_median <= lived.lift_us_p99
 
 
-@pytest.mark.parametrize('change, finding', [
-    (lambda messages: messages[:5] + messages[6:], ('frames_lost', 1)),
-    (lambda messages: messages[1:] + messages[:1], ('order_kept', False)),
-    (lambda messages: messages + messages[-1:], ('order_kept', False)),
-])
+@pytest.mark.parametrize(
+    "change, finding",
+    [
+        (lambda messages: messages[:5] + messages[6:], ("frames_lost", 1)),
+        (lambda messages: messages[1:] + messages[:1], ("order_kept", False)),
+        (lambda messages: messages + messages[-1:], ("order_kept", False)),
+    ],
+)
 def test_what_compare_must_find(two_seconds, model_file, tmp_path, change, finding):
-    done = replay(two_seconds, open_stream(model_file), tmp_path / 'out.mcap')
-    records = change(list(read_records(tmp_path / 'out.mcap', ['/lifter/poses'])))
-    with BagWriter(tmp_path / 'changed.mcap') as writer:
+    done = replay(two_seconds, open_stream(model_file), tmp_path / "out.mcap")
+    records = change(list(read_records(tmp_path / "out.mcap", ["/lifter/poses"])))
+    with BagWriter(tmp_path / "changed.mcap") as writer:
         for record in records:
             writer.write_record(record)
     key, value = finding
-    assert compare(done, tmp_path / 'changed.mcap')[1][key] == value
+    assert compare(done, tmp_path / "changed.mcap")[1][key] == value
 
 
 def test_compare_measures_the_difference(two_seconds, model_file, tmp_path):
     """One coordinate of one person moved by a hundredth of the skeleton's extent; one person left out of a frame."""
-    done = replay(two_seconds, open_stream(model_file), tmp_path / 'out.mcap')
-    messages = [message for *_, message, _ in read_messages(tmp_path / 'out.mcap', ['/lifter/poses'])]
+    done = replay(two_seconds, open_stream(model_file), tmp_path / "out.mcap")
+    messages = [message for *_, message, _ in read_messages(tmp_path / "out.mcap", ["/lifter/poses"])]
     full = [number for number, message in enumerate(messages) if message.poses]
     points = done.frames[full[0]].lifted.points[done.frames[full[0]].lifted.ok][0]
     messages[full[0]].poses[3].position.x += 0.01 * np.ptp(points, axis=0).max()
     messages[full[-1]].poses = messages[full[-1]].poses[17:]
-    with BagWriter(tmp_path / 'changed.mcap', BagMessages()) as writer:
+    with BagWriter(tmp_path / "changed.mcap", BagMessages()) as writer:
         for number, message in enumerate(messages):
-            writer.write('/lifter/poses', message, number)
-    agreement = compare(done, tmp_path / 'changed.mcap')[1]
-    assert agreement['max_difference_relative'] == pytest.approx(0.01)
-    assert agreement['frames_with_other_persons'] == 1
+            writer.write("/lifter/poses", message, number)
+    agreement = compare(done, tmp_path / "changed.mcap")[1]
+    assert agreement["max_difference_relative"] == pytest.approx(0.01)
+    assert agreement["frames_with_other_persons"] == 1
 
 
 def test_node_that_cannot_start_is_told(two_seconds, tmp_path):
     with pytest.raises(DemoError, match="no model 'nobody'"):
-        run_live(two_seconds, tmp_path / 'x.mcap', 'nobody')
+        run_live(two_seconds, tmp_path / "x.mcap", "nobody")
     assert not list(tmp_path.iterdir())
 
 
 def test_bags_are_found():
-    assert [find_bag(name).parent for name in BAGS] == [Path(__file__).resolve().parent.parent / 'bags'] * 2
-    with pytest.raises(BagError, match='make_bags.py'):
-        find_bag('opera')
+    assert [find_bag(name).parent for name in BAGS] == [Path(__file__).resolve().parent.parent / "bags"] * 2
+    with pytest.raises(BagError, match="make_bags.py"):
+        find_bag("opera")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error measures against cases whose value is known by construction."""
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -24,53 +24,60 @@ PATIENCE = 60.0
 class Bench:
     """The other side: publishes to one lifter and keeps what it says, by output name."""
 
-    def __init__(self, ros, lifter: LifterProcess, kind: str = 'sensor_msgs/msg/PointCloud2',
-                 best_effort: bool = False) -> None:
+    def __init__(
+        self, ros, lifter: LifterProcess, kind: str = "sensor_msgs/msg/PointCloud2", best_effort: bool = False
+    ) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
         from std_msgs.msg import String
 
         self.ros, self.lifter, self.stamp = ros, lifter, 100_000
-        self.node = ros.create_node('bench', namespace=lifter.namespace)
-        self.got = {name: [] for name in ('poses', 'keypoints3d', 'markers', 'layout', 'diagnostics')}
+        self.node = ros.create_node("bench", namespace=lifter.namespace)
+        self.got = {name: [] for name in ("poses", "keypoints3d", "markers", "layout", "diagnostics")}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-        self.keypoints = self.node.create_publisher(class_of(kind), 'keypoints',
-                                                    QoSProfile(depth=10, reliability=reliability))
-        self.camera = self.node.create_publisher(class_of('sensor_msgs/msg/CameraInfo'), 'camera_info', 10)
-        for name, type_name in (('poses', 'geometry_msgs/msg/PoseArray'),
-                                ('keypoints3d', 'sensor_msgs/msg/PointCloud2'),
-                                ('markers', 'visualization_msgs/msg/MarkerArray')):
-            self.node.create_subscription(class_of(type_name), f'lifter/{name}', self.got[name].append, 10)
-        self.node.create_subscription(String, 'lifter/layout', self.got['layout'].append, latched)
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+        self.keypoints = self.node.create_publisher(
+            class_of(kind), "keypoints", QoSProfile(depth=10, reliability=reliability)
+        )
+        self.camera = self.node.create_publisher(class_of("sensor_msgs/msg/CameraInfo"), "camera_info", 10)
+        for name, type_name in (
+            ("poses", "geometry_msgs/msg/PoseArray"),
+            ("keypoints3d", "sensor_msgs/msg/PointCloud2"),
+            ("markers", "visualization_msgs/msg/MarkerArray"),
+        ):
+            self.node.create_subscription(class_of(type_name), f"lifter/{name}", self.got[name].append, 10)
+        self.node.create_subscription(String, "lifter/layout", self.got["layout"].append, latched)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
     def close(self) -> None:
         self.node.destroy_node()
 
     def _on_diagnostics(self, msg) -> None:
         for status in msg.status:
-            if status.name == f'{self.lifter.namespace}/lifter: lifting':
+            if status.name == f"{self.lifter.namespace}/lifter: lifting":
                 stamp = msg.header.stamp
-                self.got['diagnostics'].append((stamp.sec * 10 ** 9 + stamp.nanosec, status))
+                self.got["diagnostics"].append((stamp.sec * 10**9 + stamp.nanosec, status))
 
     def until(self, condition, what: str) -> None:
         """Waits for a condition while messages come in; fails with the node's log."""
         end = time.monotonic() + PATIENCE
         while not condition():
-            assert self.lifter.process.poll() is None, f'the node ended\n{self.lifter.log()}'
-            assert time.monotonic() < end, f'never came: {what}\n{self.lifter.log()}'
+            assert self.lifter.process.poll() is None, f"the node ended\n{self.lifter.log()}"
+            assert time.monotonic() < end, f"never came: {what}\n{self.lifter.log()}"
             self.ros.spin_once(self.node, timeout_sec=0.02)
 
     def matched(self) -> None:
         """Until publishers and subscribers of both sides know each other: all outputs answer probes."""
-        self.until(lambda: self.keypoints.get_subscription_count() and self.camera.get_subscription_count(),
-                   'subscriptions of the node')
+        self.until(
+            lambda: self.keypoints.get_subscription_count() and self.camera.get_subscription_count(),
+            "subscriptions of the node",
+        )
 
         def answered():
             self.send(nobody())
-            return all(self.got[name] for name in ('poses', 'keypoints3d', 'markers', 'layout'))
-        self.until(answered, 'answers on all outputs')
+            return all(self.got[name] for name in ("poses", "keypoints3d", "markers", "layout"))
+
+        self.until(answered, "answers on all outputs")
 
     def send(self, fill) -> int:
         """Publishes fill(header) with a stamp of its own; returns the stamp's seconds."""
@@ -80,24 +87,26 @@ class Bench:
 
     def answer(self, name: str, seconds: int):
         """The output with this stamp."""
+
         def stamped():
             return [msg for msg in self.got[name] if header_in(msg).stamp.sec == seconds]
-        self.until(stamped, f'{name} of stamp {seconds}')
+
+        self.until(stamped, f"{name} of stamp {seconds}")
         return stamped()[0]
 
     def lifts(self) -> np.ndarray:
         """A good frame is answered by its persons, (N, 17, 3)."""
-        poses = self.answer('poses', self.send(good())).poses
+        poses = self.answer("poses", self.send(good())).poses
         assert len(poses) == 17
         return np.array([(p.position.x, p.position.y, p.position.z) for p in poses]).reshape(-1, 17, 3)
 
     def units(self) -> str:
-        return json.loads(self.got['layout'][-1].data)['units']
+        return json.loads(self.got["layout"][-1].data)["units"]
 
     def next_diagnostics(self):
         """The first status that was made after now; one may be on its way already."""
-        now, got = time.time_ns(), self.got['diagnostics']
-        self.until(lambda: got and got[-1][0] > now, 'diagnostics')
+        now, got = time.time_ns(), self.got["diagnostics"]
+        self.until(lambda: got and got[-1][0] > now, "diagnostics")
         return got[-1][1]
 
     def diagnosed(self) -> dict:
@@ -105,7 +114,7 @@ class Bench:
 
 
 def header_in(msg):
-    return msg.markers[0].header if hasattr(msg, 'markers') else msg.header
+    return msg.markers[0].header if hasattr(msg, "markers") else msg.header
 
 
 def class_of(type_name: str) -> type:
@@ -114,12 +123,14 @@ def class_of(type_name: str) -> type:
 
 def cloud(xy: np.ndarray, **changes):
     """header -> a keypoint cloud with some of its fields changed."""
+
     def fill(header):
         ids = [str(person) for person in range(len(xy))]
         msg = outputs.keypoints_cloud(MAKE, header, xy, np.ones(xy.shape[:2]), ids)
         for name, value in changes.items():
             setattr(msg, name, value)
         return msg
+
     return fill
 
 
@@ -129,10 +140,19 @@ def good():
 
 def crowd(header):
     """10,000 persons in one byte a point, x and y the same: best effort may lose a message of megabytes."""
-    same = [MAKE('sensor_msgs/msg/PointField', name=name, offset=0, datatype=2, count=1) for name in 'xy']
-    return MAKE('sensor_msgs/msg/PointCloud2', header=header, height=10_000, width=17, fields=same,
-                is_bigendian=False, point_step=1, row_step=17, data=MAKE.octets(bytes(170_000)),
-                is_dense=True)
+    same = [MAKE("sensor_msgs/msg/PointField", name=name, offset=0, datatype=2, count=1) for name in "xy"]
+    return MAKE(
+        "sensor_msgs/msg/PointCloud2",
+        header=header,
+        height=10_000,
+        width=17,
+        fields=same,
+        is_bigendian=False,
+        point_step=1,
+        row_step=17,
+        data=MAKE.octets(bytes(170_000)),
+        is_dense=True,
+    )
 
 
 def nobody():
@@ -140,72 +160,77 @@ def nobody():
 
 
 def fields(*names_and_datatypes) -> list:
-    return [MAKE('sensor_msgs/msg/PointField', name=name, offset=4 * index, datatype=datatype, count=1)
-            for index, (name, datatype) in enumerate(names_and_datatypes)]
+    return [
+        MAKE("sensor_msgs/msg/PointField", name=name, offset=4 * index, datatype=datatype, count=1)
+        for index, (name, datatype) in enumerate(names_and_datatypes)
+    ]
 
 
 #: Bad input -> (message, the reason it is counted by, a word of the advice in the log).
 BAD = {
-    'wrong field names': (cloud(seen(GOOD), fields=fields(('u', 7), ('v', 7))), 'wrong_fields', 'x and y'),
+    "wrong field names": (cloud(seen(GOOD), fields=fields(("u", 7), ("v", 7))), "wrong_fields", "x and y"),
     # Its advice is not in the log: the same reason is not explained again within seconds.
-    'wrong field type': (cloud(seen(GOOD), fields=fields(('x', 7), ('y', 99))), 'wrong_fields', ''),
-    '3D cloud': (cloud(seen(GOOD), fields=fields(('x', 7), ('y', 7), ('z', 7))), 'not_2d', '3D cloud'),
-    'NaN everywhere': (cloud(np.full((1, 17, 2), np.nan)), 'person_too_few_points', 'left out'),
-    '10,000 persons': (crowd, 'too_many_persons', 'max_persons'),
-    'wrong number of points': (cloud(np.ones((1, 25, 2))), 'wrong_point_count', 'body25'),
-    'absurd size': (cloud(seen(GOOD), height=2 ** 32 - 1), 'truncated_data', 'bytes'),
-    'absurd step': (cloud(seen(GOOD), row_step=1, height=2), 'wrong_steps', 'row_step'),
+    "wrong field type": (cloud(seen(GOOD), fields=fields(("x", 7), ("y", 99))), "wrong_fields", ""),
+    "3D cloud": (cloud(seen(GOOD), fields=fields(("x", 7), ("y", 7), ("z", 7))), "not_2d", "3D cloud"),
+    "NaN everywhere": (cloud(np.full((1, 17, 2), np.nan)), "person_too_few_points", "left out"),
+    "10,000 persons": (crowd, "too_many_persons", "max_persons"),
+    "wrong number of points": (cloud(np.ones((1, 25, 2))), "wrong_point_count", "body25"),
+    "absurd size": (cloud(seen(GOOD), height=2**32 - 1), "truncated_data", "bytes"),
+    "absurd step": (cloud(seen(GOOD), row_step=1, height=2), "wrong_steps", "row_step"),
 }
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def bench(ros, start_lifter, model_file):
     """One lifter with the shipped parameter file and no CameraInfo, shared by the tests that leave it so."""
-    lifter = start_lifter('--params-file', str(ROOT / 'config' / 'lifter.yaml'), '-p', f'model:={model_file}')
+    lifter = start_lifter("--params-file", str(ROOT / "config" / "lifter.yaml"), "-p", f"model:={model_file}")
     bench = Bench(ros, lifter)
     bench.matched()
     yield bench
     bench.close()
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope="module")
 def after_bad_input(bench):
     """Diagnostics after every bad message, each sent until it is complained of, then a good one answered."""
     for fill, reason, _ in BAD.values():
+
         def complained():
             bench.send(fill)
             bench.lifts()
-            return f'dropped: {reason}' in bench.lifter.log()
+            return f"dropped: {reason}" in bench.lifter.log()
+
         bench.until(complained, reason)
     return bench.diagnosed()
 
 
 def test_without_camera_info_units_are_the_models_and_it_says_so_once(bench):
     points = bench.lifts()
-    assert bench.units() == 'model'
+    assert bench.units() == "model"
     # The root point of a person in model units is the origin.
     np.testing.assert_allclose(points[0, [11, 12]].mean(axis=0), 0, atol=1e-9)
     for _ in range(2):
         bench.diagnosed()
-    assert bench.lifter.log().count('model units') == 1
+    assert bench.lifter.log().count("model units") == 1
 
 
 def test_header_is_the_inputs_in_every_output(bench):
     def fill(header):
         header.stamp.sec, header.stamp.nanosec = 2_000_000_123, 999_999_999
-        header.frame_id = 'left eye/optical'
+        header.frame_id = "left eye/optical"
         return good()(header)
+
     bench.send(fill)
-    for name in ('poses', 'keypoints3d', 'markers'):
+    for name in ("poses", "keypoints3d", "markers"):
         header = header_in(bench.answer(name, 2_000_000_123))
-        assert (header.stamp.nanosec, header.frame_id) == (999_999_999, 'left eye/optical')
+        assert (header.stamp.nanosec, header.frame_id) == (999_999_999, "left eye/optical")
 
 
 def test_outputs_agree_with_each_other(bench):
     seconds = bench.send(good())
-    poses, points, markers = (bench.answer(name, seconds) for name in ('poses', 'keypoints3d', 'markers'))
+    poses, points, markers = (bench.answer(name, seconds) for name in ("poses", "keypoints3d", "markers"))
     xyz = np.array([(p.position.x, p.position.y, p.position.z) for p in poses.poses])
-    data = np.frombuffer(points.data, '<f4').reshape(points.height, points.width, 6)
+    data = np.frombuffer(points.data, "<f4").reshape(points.height, points.width, 6)
     np.testing.assert_allclose(data[0, :, :3], xyz, atol=1e-5)
     np.testing.assert_array_equal(data[0, :, 3:], [(1, keypoint, 0) for keypoint in range(17)])
     spheres = np.array([(p.x, p.y, p.z) for p in markers.markers[1].points])
@@ -214,26 +239,26 @@ def test_outputs_agree_with_each_other(bench):
 
 def test_zero_persons_are_answered_by_empty_outputs(bench):
     seconds = bench.send(nobody())
-    assert len(bench.answer('poses', seconds).poses) == 0
-    assert bench.answer('keypoints3d', seconds).height == 0
-    assert bench.answer('markers', seconds).markers[0].action == 2
+    assert len(bench.answer("poses", seconds).poses) == 0
+    assert bench.answer("keypoints3d", seconds).height == 0
+    assert bench.answer("markers", seconds).markers[0].action == 2
 
 
-@pytest.mark.parametrize('case', BAD)
+@pytest.mark.parametrize("case", BAD)
 def test_bad_input_is_counted_explained_and_survived(after_bad_input, bench, case):
     _, reason, advice = BAD[case]
     sent = sum(other == reason for _, other, _ in BAD.values())
-    assert int(after_bad_input[f'dropped_{reason}']) >= sent
+    assert int(after_bad_input[f"dropped_{reason}"]) >= sent
     assert any(reason in line and advice in line for line in bench.lifter.log().splitlines())
-    assert 'Traceback' not in bench.lifter.log() and 'dropped_internal_error' not in after_bad_input
+    assert "Traceback" not in bench.lifter.log() and "dropped_internal_error" not in after_bad_input
 
 
 def test_stamps_going_backwards_are_lifted_and_noted(bench):
     bench.lifts()
-    before = int(bench.diagnosed().get('noted_stamp_backwards', 0))
+    before = int(bench.diagnosed().get("noted_stamp_backwards", 0))
     bench.stamp -= 50_000
     bench.lifts()
-    assert int(bench.diagnosed()['noted_stamp_backwards']) == before + 1
+    assert int(bench.diagnosed()["noted_stamp_backwards"]) == before + 1
 
 
 def test_frames_that_come_while_the_node_is_busy_are_counted(bench):
@@ -247,20 +272,20 @@ def test_frames_that_come_while_the_node_is_busy_are_counted(bench):
         bench.lifter.process.send_signal(signal.SIGCONT)
     bench.lifts()
     after = bench.diagnosed()
-    missed = int(after['dropped_missed']) - int(before.get('dropped_missed', 0))
-    lifted = int(after['frames']) - int(before['frames'])
+    missed = int(after["dropped_missed"]) - int(before.get("dropped_missed", 0))
+    lifted = int(after["frames"]) - int(before["frames"])
     assert missed > 0 and missed + lifted == 101
 
 
 def test_diagnostics_tell_counts_times_units_and_model(bench, model_file):
     bench.lifts()
     values = bench.diagnosed()
-    assert int(values['frames']) >= int(values['lifted']) > 0
-    assert 0 < float(values['lift_us_median']) <= float(values['lift_us_p99'])
-    assert (values['units'], values['model'], len(values['model_sha256'])) == ('model', 'stand', 64)
-    assert values['input_type'] == 'sensor_msgs/msg/PointCloud2'
+    assert int(values["frames"]) >= int(values["lifted"]) > 0
+    assert 0 < float(values["lift_us_median"]) <= float(values["lift_us_p99"])
+    assert (values["units"], values["model"], len(values["model_sha256"])) == ("model", "stand", 64)
+    assert values["input_type"] == "sensor_msgs/msg/PointCloud2"
     status = bench.next_diagnostics()
-    assert status.level == b'\x01' and 'no keypoints' in status.message
+    assert status.level == b"\x01" and "no keypoints" in status.message
 
 
 def set_parameter(bench, **values):
@@ -268,12 +293,13 @@ def set_parameter(bench, **values):
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
 
-    client = bench.node.create_client(SetParameters, 'lifter/set_parameters')
-    bench.until(client.service_is_ready, 'the parameter service')
+    client = bench.node.create_client(SetParameters, "lifter/set_parameters")
+    bench.until(client.service_is_ready, "the parameter service")
     request = SetParameters.Request(
-        parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in values.items()])
+        parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    )
     future = client.call_async(request)
-    bench.until(future.done, 'the answer of the parameter service')
+    bench.until(future.done, "the answer of the parameter service")
     return [result.successful for result in future.result().results]
 
 
@@ -281,10 +307,10 @@ def test_parameters_may_change_where_the_table_says_so(bench):
     assert set_parameter(bench, max_persons=1) == [True]
     bench.send(cloud(seen(persons_at((0, 0, 4), (1, 0, 4)))))
     bench.lifts()
-    assert int(bench.diagnosed()['dropped_too_many_persons']) >= 1
+    assert int(bench.diagnosed()["dropped_too_many_persons"]) >= 1
     assert set_parameter(bench, max_persons=64, min_confidence=0.5) == [True, True]
     assert set_parameter(bench, min_confidence=1.5) == [False]
-    assert set_parameter(bench, model='other') == [False]
+    assert set_parameter(bench, model="other") == [False]
 
 
 def test_a_subscriber_with_a_qos_that_cannot_match_is_warned_about(bench):
@@ -292,72 +318,78 @@ def test_a_subscriber_with_a_qos_that_cannot_match_is_warned_about(bench):
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    subscription = bench.node.create_subscription(PoseArray, 'lifter/poses', lambda msg: None, latched)
-    bench.until(lambda: 'DURABILITY' in bench.lifter.log(), 'the warning')
+    subscription = bench.node.create_subscription(PoseArray, "lifter/poses", lambda msg: None, latched)
+    bench.until(lambda: "DURABILITY" in bench.lifter.log(), "the warning")
     bench.node.destroy_subscription(subscription)
 
 
 def test_no_torch_in_the_node(bench):
     bench.lifts()
-    with open(f'/proc/{bench.lifter.process.pid}/maps', encoding='utf-8') as maps:
+    with open(f"/proc/{bench.lifter.process.pid}/maps", encoding="utf-8") as maps:
         mapped = maps.read()
-    assert 'rclpy' in mapped and 'torch' not in mapped
-    done = subprocess.run([sys.executable, '-X', 'importtime', '-m', 'paul_ros.node', '--help'], cwd=ROOT,
-                          capture_output=True, text=True, check=True)
-    imported = {line.rpartition('|')[2].strip().split('.')[0] for line in done.stderr.splitlines()}
-    assert 'numpy' in imported and not imported & {'torch', 'training', 'rosbags', 'mcap', 'scipy'}
-    assert 'min_confidence' in done.stdout
+    assert "rclpy" in mapped and "torch" not in mapped
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "paul_ros.node", "--help"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    imported = {line.rpartition("|")[2].strip().split(".")[0] for line in done.stderr.splitlines()}
+    assert "numpy" in imported and not imported & {"torch", "training", "rosbags", "mcap", "scipy"}
+    assert "min_confidence" in done.stdout
 
 
 def test_camera_info_turns_model_units_into_metres(ros, start_lifter, model_file):
-    bench = Bench(ros, start_lifter('-p', f'model:={model_file}'))
+    bench = Bench(ros, start_lifter("-p", f"model:={model_file}"))
     bench.matched()
-    assert bench.units() == 'model'
+    assert bench.units() == "model"
     bench.camera.publish(camera_info(MAKE, fx=0.0))
-    bench.until(lambda: 'bad_intrinsics' in bench.lifter.log(), 'the warning')
-    assert bench.diagnosed()['dropped_bad_intrinsics'] == '1' and bench.units() == 'model'
+    bench.until(lambda: "bad_intrinsics" in bench.lifter.log(), "the warning")
+    assert bench.diagnosed()["dropped_bad_intrinsics"] == "1" and bench.units() == "model"
     bench.camera.publish(camera_info(MAKE))
-    bench.until(lambda: bench.units() == 'm', 'the new layout')
+    bench.until(lambda: bench.units() == "m", "the new layout")
     points = bench.lifts()
     assert np.linalg.norm(points - GOOD, axis=-1).max() < 0.15
-    assert bench.diagnosed()['units'] == 'm'
+    assert bench.diagnosed()["units"] == "m"
     bench.close()
-    assert 'ready' in bench.lifter.log()
+    assert "ready" in bench.lifter.log()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_in_the_midst_of_frames_ends_it_cleanly(ros, start_lifter, model_file, number):
-    bench = Bench(ros, start_lifter('-p', f'model:={model_file}'))
+    bench = Bench(ros, start_lifter("-p", f"model:={model_file}"))
     bench.matched()
     for _ in range(200):
         bench.send(good())
     assert bench.lifter.stop(number) == 0
     bench.close()
     log = bench.lifter.log()
-    assert 'Traceback' not in log and 'internal_error' not in log
-    assert log.splitlines()[-1].startswith('lifter: ')
+    assert "Traceback" not in log and "internal_error" not in log
+    assert log.splitlines()[-1].startswith("lifter: ")
 
 
 def test_pose_array_of_a_best_effort_publisher(ros, start_lifter, model_file):
-    lifter = start_lifter('-p', f'model:={model_file}')
-    bench = Bench(ros, lifter, 'geometry_msgs/msg/PoseArray', best_effort=True)
+    lifter = start_lifter("-p", f"model:={model_file}")
+    bench = Bench(ros, lifter, "geometry_msgs/msg/PoseArray", best_effort=True)
     xyz = np.concatenate([seen(persons_at((0, 0, 4), (1, 0, 4))), np.full((2, 17, 1), 0.9)], axis=-1)
 
     def answered():
         bench.send(lambda header: outputs.pose_array(MAKE, header, xyz))
-        return any(len(msg.poses) == 34 for msg in bench.got['poses'])
-    bench.until(answered, 'two persons')
+        return any(len(msg.poses) == 34 for msg in bench.got["poses"])
+
+    bench.until(answered, "two persons")
     bench.send(lambda header: outputs.pose_array(MAKE, header, xyz * 3))
-    bench.until(lambda: 'not_2d' in lifter.log(), 'the drop')
+    bench.until(lambda: "not_2d" in lifter.log(), "the drop")
     bench.close()
     assert lifter.stop() == 0
-    assert '1 not_2d' in lifter.log().splitlines()[-1]
+    assert "1 not_2d" in lifter.log().splitlines()[-1]
 
 
 def test_an_input_that_cannot_be_read_is_named_and_a_good_one_is_found_later(ros, start_lifter, model_file):
-    lifter = start_lifter('-p', f'model:={model_file}')
-    wrong = Bench(ros, lifter, 'std_msgs/msg/String')
-    wrong.until(lambda: 'std_msgs/msg/String, which cannot be read' in lifter.log(), 'the warning')
+    lifter = start_lifter("-p", f"model:={model_file}")
+    wrong = Bench(ros, lifter, "std_msgs/msg/String")
+    wrong.until(lambda: "std_msgs/msg/String, which cannot be read" in lifter.log(), "the warning")
     wrong.close()
     bench = Bench(ros, lifter)
     bench.matched()
@@ -366,10 +398,10 @@ def test_an_input_that_cannot_be_read_is_named_and_a_good_one_is_found_later(ros
 
 
 def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, model_file):
-    lifter = start_lifter('-p', f'model:={model_file}', '-p', 'input_type:=yolo_msgs/msg/DetectionArray')
+    lifter = start_lifter("-p", f"model:={model_file}", "-p", "input_type:=yolo_msgs/msg/DetectionArray")
     bench = Bench(ros, lifter)
-    bench.until(lambda: 'yolo_msgs' in lifter.log(), 'the warning')
-    assert 'install it' in lifter.log()
+    bench.until(lambda: "yolo_msgs" in lifter.log(), "the warning")
+    assert "install it" in lifter.log()
     bench.close()
 
 
@@ -383,21 +415,26 @@ def refused(lifter: LifterProcess) -> str:
 def test_a_model_file_with_one_byte_changed_is_refused(start_lifter, model_file, tmp_path):
     data = bytearray(model_file.read_bytes())
     data[len(data) // 2] ^= 1
-    changed = tmp_path / 'changed.npz'
+    changed = tmp_path / "changed.npz"
     changed.write_bytes(data)
-    line = refused(start_lifter('-p', f'model:={changed}'))
-    assert str(changed) in line and 'damaged' in line
+    line = refused(start_lifter("-p", f"model:={changed}"))
+    assert str(changed) in line and "damaged" in line
 
 
-@pytest.mark.parametrize('argument, word', [
-    ('model:=no_such_model', 'no_such_model'), ('layout:=coco71', 'coco17'), ('min_confidence:=2.0', 'range'),
-    ('input_type:=std_msgs/msg/String', 'PointCloud2'),
-])
+@pytest.mark.parametrize(
+    "argument, word",
+    [
+        ("model:=no_such_model", "no_such_model"),
+        ("layout:=coco71", "coco17"),
+        ("min_confidence:=2.0", "range"),
+        ("input_type:=std_msgs/msg/String", "PointCloud2"),
+    ],
+)
 def test_parameters_that_cannot_be_used_are_refused(start_lifter, model_file, argument, word):
-    assert word in refused(start_lifter('-p', f'model:={model_file}', '-p', argument))
+    assert word in refused(start_lifter("-p", f"model:={model_file}", "-p", argument))
 
 
 def test_parameter_file_and_table_come_from_one_place():
-    shipped = (ROOT / 'config' / 'lifter.yaml').read_text()
-    assert shipped == parameters.as_yaml(), 'python -m paul_ros.parameters > config/lifter.yaml'
-    assert parameters.as_markdown().count('\n') == len(parameters.PARAMETERS) + 2
+    shipped = (ROOT / "config" / "lifter.yaml").read_text()
+    assert shipped == parameters.as_yaml(), "python -m paul_ros.parameters > config/lifter.yaml"
+    assert parameters.as_markdown() in (ROOT / "README.md").read_text(), "paste paul_ros.parameters.as_markdown()"

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """OnP against a naive multi-start search, its certificate, and what degenerate input gets."""
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize

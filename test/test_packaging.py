@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """One source tree serves pip, colcon and colcon --symlink-install: in each ROS finds what it starts."""
+
 from __future__ import annotations
 
 import os
@@ -16,10 +17,11 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-import paul_ros
 import pytest
 import yaml
 from catkin_pkg.package import parse_package
+
+import paul_ros
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "paul_ros"
@@ -46,7 +48,11 @@ class Install:
     def run(self, *command: object) -> str:
         answer = subprocess.run(
             [str(part) for part in command],
-            env=self.environment, cwd=self.prefix, capture_output=True, text=True, timeout=120,
+            env=self.environment,
+            cwd=self.prefix,
+            capture_output=True,
+            text=True,
+            timeout=120,
         )
         assert answer.returncode == 0, answer.stdout + answer.stderr
         return answer.stdout
@@ -57,7 +63,10 @@ def source(tmp_path_factory) -> Path:
     """A copy of what git has or would take, so that no build output of the working tree plays a part."""
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT, capture_output=True, text=True, check=True,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
     ).stdout.split("\0")
     tree = tmp_path_factory.mktemp("workspace") / "src" / PACKAGE
     for name in filter(None, listed):
@@ -87,12 +96,19 @@ def colcon_build(source: Path, folder: Path, *options: str) -> Install:
     bin_first = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     build = subprocess.run(
         ["colcon", "--log-base", "log", "build", "--base-paths", source.parent, *options],
-        cwd=folder, env=bin_first, capture_output=True, text=True,
+        cwd=folder,
+        env=bin_first,
+        capture_output=True,
+        text=True,
     )
     assert build.returncode == 0, build.stdout + build.stderr
     sourced = subprocess.run(
         ["bash", "-c", "source install/setup.bash && env -0"],
-        cwd=folder, env=bin_first, check=True, capture_output=True, text=True,
+        cwd=folder,
+        env=bin_first,
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout
     environment = dict(line.split("=", 1) for line in sourced.split("\0") if line)
     return Install(folder / "install" / PACKAGE, environment)
@@ -113,8 +129,11 @@ def test_ros2_run_finds_the_launcher_and_it_answers(install: Install, name: str,
 def test_the_launched_node_comes_up_and_ends_on_sigint(install: Install, model_file: Path) -> None:
     node = subprocess.Popen(
         [install.launcher("lifter"), "--ros-args", "-p", f"model:={model_file}"],
-        env=install.environment, cwd=install.prefix,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env=install.environment,
+        cwd=install.prefix,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     )
     try:
         seen = ""
@@ -175,6 +194,7 @@ def test_package_xml_is_valid_and_says_what_the_code_needs() -> None:
 
 def test_the_environment_runs_this_source() -> None:
     """A test that starts `paul` or the node would else judge an older state of the code."""
+
     def contents(folder: Path) -> dict[str, bytes]:
         files = (path for room in ROOMS for path in (folder / room).rglob("*"))
         wanted = (path for path in files if path.suffix in (".py", ".yaml", ".npz"))

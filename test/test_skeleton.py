@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Layouts: the shipped ones are right, mapping goes by name, and what is no layout is refused with advice."""
+
 from __future__ import annotations
 
 import copy
@@ -11,10 +12,17 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from paul_ros.skeleton import Layout, LayoutError, layout_names, load_layout
 
 POINTS = {
-    "body25": 25, "cmu31": 31, "coco17": 17, "h36m17": 17, "hri18": 18, "mediapipe33": 33, "openpose18": 18,
+    "body25": 25,
+    "cmu31": 31,
+    "coco17": 17,
+    "h36m17": 17,
+    "hri18": 18,
+    "mediapipe33": 33,
+    "openpose18": 18,
 }
 DOOR = {
     "name": "door",
@@ -23,15 +31,27 @@ DOOR = {
     "left_right": [["handle", "latch"]],
     "root": "middle",
     "derived": {"middle": ["hinge_top", "hinge_bottom"]},
-    "handedness": [{
-        "left": ["handle"], "right": ["latch"], "below": ["hinge_bottom"], "above": ["hinge_top"],
-        "behind": ["latch"], "front": ["handle", "hinge_top"],
-    }],
+    "handedness": [
+        {
+            "left": ["handle"],
+            "right": ["latch"],
+            "below": ["hinge_bottom"],
+            "above": ["hinge_top"],
+            "behind": ["latch"],
+            "front": ["handle", "hinge_top"],
+        }
+    ],
 }
 #: Rough places of points of a standing person in REP-103's body frame (x forward, y left, z up), metres.
 STANDING = {
-    "nose": (0.12, 0, 1.62), "eye": (0.1, 0.03, 1.66), "ear": (0, 0.08, 1.64), "shoulder": (0, 0.2, 1.42),
-    "hip": (0, 0.1, 0.9), "knee": (0.05, 0.1, 0.48), "ankle": (0, 0.1, 0.08), "toe_tip": (0.2, 0.1, 0.02),
+    "nose": (0.12, 0, 1.62),
+    "eye": (0.1, 0.03, 1.66),
+    "ear": (0, 0.08, 1.64),
+    "shoulder": (0, 0.2, 1.42),
+    "hip": (0, 0.1, 0.9),
+    "knee": (0.05, 0.1, 0.48),
+    "ankle": (0, 0.1, 0.08),
+    "toe_tip": (0.2, 0.1, 0.02),
 }
 
 
@@ -171,13 +191,12 @@ def test_mapping_refuses_layouts_that_share_too_little_and_says_which_fit() -> N
         load_layout("coco17").map_to(Layout.from_dict(DOOR))
 
 
-def test_difference_says_how_two_layouts_differ() -> None:
-    coco, openpose = load_layout("coco17"), load_layout("openpose18")
-    assert coco.difference(load_layout("coco17")) == ""
-    assert coco.difference(openpose) == "18 points for 17, with 'neck'"
-    assert openpose.difference(coco) == "17 points for 18, without 'neck'"
-    swap = openpose.difference(load_layout("hri18"))
-    assert swap == "same points in another order, first at index 14: 'left_eye' for 'right_eye'"
+def test_mirrored_edges_are_those_of_the_other_side() -> None:
+    layout = load_layout("coco17")
+    left, middle = layout.edges.index((5, 7)), layout.edges.index((5, 6))
+    assert layout.edges[layout.mirrored_edges[left]] == (6, 8)
+    assert layout.mirrored_edges[middle] == middle
+    np.testing.assert_array_equal(layout.mirrored_edges[layout.mirrored_edges], np.arange(len(layout.edges)))
 
 
 def test_a_users_layout_is_loaded_from_its_path(tmp_path) -> None:
@@ -196,39 +215,45 @@ def test_all_but_name_names_and_root_may_be_left_out() -> None:
     assert Layout.from_dict(layout.to_dict()) == layout
 
 
-@pytest.mark.parametrize("name, advice", [
-    ("coco", "did you mean 'coco17'"),
-    ("Body_25", "did you mean 'body25'"),
-    ("excavator", "There are body25, cmu31"),
-    ("nowhere/door.yaml", "nowhere/door.yaml: No such file"),
-])
+@pytest.mark.parametrize(
+    "name, advice",
+    [
+        ("coco", "did you mean 'coco17'"),
+        ("Body_25", "did you mean 'body25'"),
+        ("excavator", "There are body25, cmu31"),
+        ("nowhere/door.yaml", "nowhere/door.yaml: No such file"),
+    ],
+)
 def test_an_unknown_name_is_answered_with_the_known_ones(name: str, advice: str) -> None:
     with pytest.raises(LayoutError, match=advice):
         load_layout(name)
 
 
-@pytest.mark.parametrize("changes, message", [
-    ({"names": ["a", "b", "c", "a"]}, "'a' more than once"),
-    ({"names": ["a", "b"]}, "has 2 points"),
-    ({"names": ["hinge_top", False, "handle", "latch"]}, "YAML reads it as False: put it in quotes"),
-    ({"names": ["a", "", "c"]}, "must be text, not empty"),
-    ({"names": "hinge_top"}, "names must be a list, not str"),
-    ({"name": None}, "name must be text, not NoneType"),
-    ({"edges": [["hinge_top", "handel"]]}, "edges names 'handel', not in names"),
-    ({"edges": [["hinge_top"]]}, "edges must be pairs"),
-    ({"edges": [["latch", "latch"]]}, "two different points"),
-    ({"edges": {"hinge_top": "latch"}}, "edges must be a list, not dict"),
-    ({"left_right": [["handle", "latch"], ["handle", "hinge_top"]]}, "a point in two pairs"),
-    ({"root": "centre"}, "root names 'centre'"),
-    ({"root": []}, "root names no point"),
-    ({"derived": {"handle": ["latch"]}}, "derived 'handle' is among the names already"),
-    ({"derived": {"middle": ["top"]}}, "derived 'middle' names 'top'"),
-    ({"derived": ["middle"]}, "derived must be a mapping, not list"),
-    ({"handedness": [{"left": ["handle"]}]}, "all of them"),
-    ({"handedness": [7]}, "must be a mapping, not int"),
-    ({"edge": []}, "unknown key 'edge'"),
-    ({"names": [f"p{i}" for i in range(20_001)]}, "20001 points"),
-])
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"names": ["a", "b", "c", "a"]}, "'a' more than once"),
+        ({"names": ["a", "b"]}, "has 2 points"),
+        ({"names": ["hinge_top", False, "handle", "latch"]}, "YAML reads it as False: put it in quotes"),
+        ({"names": ["a", "", "c"]}, "must be text, not empty"),
+        ({"names": "hinge_top"}, "names must be a list, not str"),
+        ({"name": None}, "name must be text, not NoneType"),
+        ({"edges": [["hinge_top", "handel"]]}, "edges names 'handel', not in names"),
+        ({"edges": [["hinge_top"]]}, "edges must be pairs"),
+        ({"edges": [["latch", "latch"]]}, "two different points"),
+        ({"edges": {"hinge_top": "latch"}}, "edges must be a list, not dict"),
+        ({"left_right": [["handle", "latch"], ["handle", "hinge_top"]]}, "a point in two pairs"),
+        ({"root": "centre"}, "root names 'centre'"),
+        ({"root": []}, "root names no point"),
+        ({"derived": {"handle": ["latch"]}}, "derived 'handle' is among the names already"),
+        ({"derived": {"middle": ["top"]}}, "derived 'middle' names 'top'"),
+        ({"derived": ["middle"]}, "derived must be a mapping, not list"),
+        ({"handedness": [{"left": ["handle"]}]}, "all of them"),
+        ({"handedness": [7]}, "must be a mapping, not int"),
+        ({"edge": []}, "unknown key 'edge'"),
+        ({"names": [f"p{i}" for i in range(20_001)]}, "20001 points"),
+    ],
+)
 def test_a_wrong_layout_is_refused_with_the_key_at_fault(changes: dict, message: str) -> None:
     with pytest.raises(LayoutError, match=message):
         Layout.from_dict(door(**changes))
@@ -242,15 +267,19 @@ def test_a_missing_key_is_named(key: str) -> None:
         Layout.from_dict(data)
 
 
-@pytest.mark.parametrize("content, message", [
-    (b"", "must be a mapping, not NoneType"),
-    (b"- a\n- b\n", "must be a mapping, not list"),
-    (b"name: [unclosed", "no YAML"),
-    (b"name: \x80\x81", "no YAML"),
-    (b"a: !!python/object/apply:os.getcwd []", "no YAML"),
-    (b"[" * 5000, "no YAML"),
-    (b"#" * 1_000_001, "1000001 bytes"),
-], ids=["empty", "list", "unclosed", "bytes", "python", "nested", "huge"])
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (b"", "must be a mapping, not NoneType"),
+        (b"- a\n- b\n", "must be a mapping, not list"),
+        (b"name: [unclosed", "no YAML"),
+        (b"name: \x80\x81", "no YAML"),
+        (b"a: !!python/object/apply:os.getcwd []", "no YAML"),
+        (b"[" * 5000, "no YAML"),
+        (b"#" * 1_000_001, "1000001 bytes"),
+    ],
+    ids=["empty", "list", "unclosed", "bytes", "python", "nested", "huge"],
+)
 def test_a_file_that_is_no_layout_is_refused(tmp_path, content: bytes, message: str) -> None:
     path = tmp_path / "broken.yaml"
     path.write_bytes(content)

@@ -12,10 +12,10 @@ from conftest import camera_info, header_of, persons_at, seen
 from msg_adapters import outputs
 from paul_ros.lifter import Lifter
 from paul_ros.model import load_model
-from paul_ros.skeleton import LayoutError, Layout, load_layout
+from paul_ros.skeleton import Layout, LayoutError, load_layout
 from paul_ros.stream import OUTPUTS, LiftStream
 
-CLOUD = 'sensor_msgs/msg/PointCloud2'
+CLOUD = "sensor_msgs/msg/PointCloud2"
 GOOD = persons_at((0.3, 0, 4), (-1, 0.1, 5))
 
 
@@ -40,7 +40,7 @@ def assert_lifts(stream: LiftStream, make) -> None:
 def test_persons_in_metres_where_they_stand(stream, make):
     stream.camera_info(camera_info(make))
     frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
-    assert frame.lifted.units == 'm' and frame.lifted.ok.all()
+    assert frame.lifted.units == "m" and frame.lifted.ok.all()
     # Weak perspective leaves some per cent of the size unexplained at these distances.
     assert np.linalg.norm(frame.lifted.points - GOOD, axis=-1).max() < 0.15
     assert stream.counts == dict(frames=1, persons=2, lifted=2) and not stream.drops
@@ -48,50 +48,50 @@ def test_persons_in_metres_where_they_stand(stream, make):
 
 
 def test_units_follow_the_intrinsics(stream, make):
-    assert stream.describe()['units'] == 'model'
-    assert stream.keypoints(CLOUD, cloud(make, seen(GOOD))).lifted.units == 'model'
-    assert 'CameraInfo' in stream.describe()['scale_source']
+    assert stream.describe()["units"] == "model"
+    assert stream.keypoints(CLOUD, cloud(make, seen(GOOD))).lifted.units == "model"
+    assert "CameraInfo" in stream.describe()["scale_source"]
     stream.camera_info(camera_info(make))
-    assert stream.describe()['units'] == 'm'
+    assert stream.describe()["units"] == "m"
     stream.camera_info(camera_info(make, fx=0.0))
-    assert stream.drops == {'bad_intrinsics': 1} and stream.describe()['units'] == 'm'
+    assert stream.drops == {"bad_intrinsics": 1} and stream.describe()["units"] == "m"
     assert_lifts(stream, make)
 
 
 def test_model_without_metres_stays_in_model_units(model_file, make):
     model = load_model(model_file)
-    model.header['metres_per_unit'] = None
+    model.header["metres_per_unit"] = None
     stream = LiftStream(Lifter(model), model.layout, 0.3, 64)
     stream.camera_info(camera_info(make))
-    assert stream.keypoints(CLOUD, cloud(make, seen(GOOD))).lifted.units == 'model'
-    assert 'size in metres' in stream.describe()['scale_source']
+    assert stream.keypoints(CLOUD, cloud(make, seen(GOOD))).lifted.units == "model"
+    assert "size in metres" in stream.describe()["scale_source"]
 
 
 def test_description_says_what_the_outputs_mean(stream, model_file):
     described = stream.describe()
     model = load_model(model_file)
-    assert described['keypoints'] == list(load_layout('coco17').names)
-    assert (described['layout'], described['model']) == ('coco17', 'stand')
-    assert described['model_sha256'] == model.sha256
-    assert described['metres_per_unit'] == model.metres_per_unit and described['chirality']['known'] is True
+    assert described["keypoints"] == list(load_layout("coco17").names)
+    assert (described["layout"], described["model"]) == ("coco17", "stand")
+    assert described["model_sha256"] == model.sha256
+    assert described["metres_per_unit"] == model.metres_per_unit and described["chirality"]["known"] is True
 
 
 def test_messages_of_a_frame(stream, make, bag_make):
     stream.camera_info(camera_info(make))
     confidence = np.full((2, 17), 0.75)
     confidence[1, 9] = 0.1
-    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD), confidence, ['5', 'anna']))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD), confidence, ["5", "anna"]))
     messages = frame.messages(make)
     assert set(messages) == set(OUTPUTS)
     if make is bag_make:
         messages = {name: make.through_cdr(message) for name, message in messages.items()}
-    poses, points, markers = messages['poses'], messages['keypoints3d'], messages['markers']
+    poses, points, markers = messages["poses"], messages["keypoints3d"], messages["markers"]
     for header in (poses.header, points.header, markers.markers[0].header, markers.markers[1].header):
         assert (header.stamp.sec, header.stamp.nanosec) == (7, 5)
-        assert header.frame_id == 'camera_color_optical_frame'
+        assert header.frame_id == "camera_color_optical_frame"
     xyz = np.array([(p.position.x, p.position.y, p.position.z) for p in poses.poses]).reshape(2, 17, 3)
     np.testing.assert_array_equal(xyz, frame.lifted.points)
-    data = np.frombuffer(points.data, '<f4').reshape(2, 17, 6)
+    data = np.frombuffer(points.data, "<f4").reshape(2, 17, 6)
     np.testing.assert_allclose(data[..., :3], frame.lifted.points, rtol=1e-6)
     np.testing.assert_array_equal(data[..., 3], np.where(confidence > 0.3, 0.75, 0))
     np.testing.assert_array_equal(data[:, 0, 5], [5, 1])
@@ -108,17 +108,19 @@ def test_low_confidence_hides_a_point_at_once_when_changed(stream, make):
 def test_another_layout_is_mapped_by_name(model_file, make):
     model = load_model(model_file)
     names = model.layout.names[::-1]
-    reversed_layout = Layout.from_dict({'name': 'reversed', 'names': list(names), 'root': ['nose']})
+    reversed_layout = Layout.from_dict({"name": "reversed", "names": list(names), "root": ["nose"]})
     stream = LiftStream(Lifter(model), reversed_layout, 0.3, 64)
     straight = LiftStream(Lifter(model), model.layout, 0.3, 64)
     xy = seen(GOOD)
-    np.testing.assert_array_equal(stream.keypoints(CLOUD, cloud(make, xy[:, ::-1])).lifted.points,
-                                  straight.keypoints(CLOUD, cloud(make, xy)).lifted.points)
+    np.testing.assert_array_equal(
+        stream.keypoints(CLOUD, cloud(make, xy[:, ::-1])).lifted.points,
+        straight.keypoints(CLOUD, cloud(make, xy)).lifted.points,
+    )
 
 
 def test_a_layout_that_does_not_fit_is_refused_at_the_start(model_file):
     model = load_model(model_file)
-    other = Layout.from_dict({'name': 'door', 'names': ['a', 'b', 'c', 'd'], 'root': ['a']})
+    other = Layout.from_dict({"name": "door", "names": ["a", "b", "c", "d"], "root": ["a"]})
     with pytest.raises(LayoutError):
         LiftStream(Lifter(model), other, 0.3, 64)
 
@@ -126,61 +128,62 @@ def test_a_layout_that_does_not_fit_is_refused_at_the_start(model_file):
 def test_persons_that_cannot_be_lifted_are_left_out_and_counted(stream, make):
     xy = seen(persons_at((0, 0, 4), (1, 0, 4), (-1, 0, 4)))
     xy[1, 2:] = np.nan
-    frame = stream.keypoints(CLOUD, cloud(make, xy, ids=['1', '2', '3']))
+    frame = stream.keypoints(CLOUD, cloud(make, xy, ids=["1", "2", "3"]))
     messages = frame.messages(make)
-    assert len(messages['poses'].poses) == 34 and messages['keypoints3d'].height == 2
-    ids = np.frombuffer(messages['keypoints3d'].data, '<f4').reshape(2, 17, 6)[:, 0, 5]
+    assert len(messages["poses"].poses) == 34 and messages["keypoints3d"].height == 2
+    ids = np.frombuffer(messages["keypoints3d"].data, "<f4").reshape(2, 17, 6)[:, 0, 5]
     np.testing.assert_array_equal(ids, [1, 3])
-    assert stream.drops == {'person_too_few_points': 1}
+    assert stream.drops == {"person_too_few_points": 1}
     assert stream.counts == dict(frames=1, persons=3, lifted=2)
 
 
 def test_nan_everywhere_is_a_frame_of_nobody_lifted(stream, make):
     frame = stream.keypoints(CLOUD, cloud(make, np.full((2, 17, 2), np.nan)))
-    assert len(frame.messages(make)['poses'].poses) == 0
-    assert stream.drops == {'person_too_few_points': 2}
+    assert len(frame.messages(make)["poses"].poses) == 0
+    assert stream.drops == {"person_too_few_points": 2}
     assert_lifts(stream, make)
 
 
 def test_zero_persons_are_a_frame(stream, make):
     messages = stream.keypoints(CLOUD, cloud(make, np.empty((0, 17, 2)))).messages(make)
-    assert len(messages['poses'].poses) == 0 and messages['keypoints3d'].height == 0
-    assert stream.counts['frames'] == 1 and not stream.drops and not stream.lift_us
+    assert len(messages["poses"].poses) == 0 and messages["keypoints3d"].height == 0
+    assert stream.counts["frames"] == 1 and not stream.drops and not stream.lift_us
 
 
 def test_too_many_persons_are_dropped(stream, make):
     assert stream.keypoints(CLOUD, cloud(make, np.ones((10_000, 17, 2)))) is None
-    assert stream.drops == {'too_many_persons': 1}
-    assert 'max_persons' in stream.explanations['too_many_persons']
+    assert stream.drops == {"too_many_persons": 1}
+    assert "max_persons" in stream.explanations["too_many_persons"]
     assert_lifts(stream, make)
 
 
 def test_a_wrong_number_of_points_names_the_layouts_that_fit(stream, make):
     assert stream.keypoints(CLOUD, cloud(make, np.ones((2, 25, 2)))) is None
-    explanation = stream.explanations['wrong_point_count']
-    assert 'body25' in explanation and 'h36m17' not in explanation and '`layout`' in explanation
+    explanation = stream.explanations["wrong_point_count"]
+    assert "body25" in explanation and "h36m17" not in explanation and "`layout`" in explanation
     assert stream.keypoints(CLOUD, cloud(make, np.ones((2, 23, 2)))) is None
-    explanation = stream.explanations['wrong_point_count']
-    assert '23' in explanation and 'path' in explanation
-    assert stream.drops == {'wrong_point_count': 2}
+    explanation = stream.explanations["wrong_point_count"]
+    assert "23" in explanation and "path" in explanation
+    assert stream.drops == {"wrong_point_count": 2}
     assert_lifts(stream, make)
 
 
 def test_stamps_going_backwards_are_used_and_noted(stream, make):
     for seconds in (5, 6, 3, 4):
         assert stream.keypoints(CLOUD, cloud(make, seen(GOOD), seconds=seconds)) is not None
-    assert stream.notes == {'stamp_backwards': 1} and not stream.drops
+    assert stream.notes == {"stamp_backwards": 1} and not stream.drops
 
 
 def test_a_fault_in_lifting_is_counted_and_its_traceback_logged_once(stream, make, monkeypatch, caplog):
     def fails(*_):
-        raise ZeroDivisionError('on purpose')
-    monkeypatch.setattr(stream.lifter, 'lift', fails)
+        raise ZeroDivisionError("on purpose")
+
+    monkeypatch.setattr(stream.lifter, "lift", fails)
     with caplog.at_level(logging.ERROR):
         for _ in range(3):
             assert stream.keypoints(CLOUD, cloud(make, seen(GOOD))) is None
-    assert stream.drops == {'internal_error': 3} and 'on purpose' in stream.explanations['internal_error']
-    assert len(caplog.records) == 1 and 'on purpose' in caplog.text
+    assert stream.drops == {"internal_error": 3} and "on purpose" in stream.explanations["internal_error"]
+    assert len(caplog.records) == 1 and "on purpose" in caplog.text
     monkeypatch.undo()
     assert_lifts(stream, make)
 
@@ -191,4 +194,5 @@ def test_the_same_messages_give_the_same_bits(model_file, make):
         stream = LiftStream(Lifter(model), model.layout, 0.3, 64)
         stream.camera_info(camera_info(make))
         return stream.keypoints(CLOUD, cloud(make, seen(GOOD))).lifted.points
+
     np.testing.assert_array_equal(run(), run())

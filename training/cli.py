@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """``paul train``: 2D keypoints in, a model file out."""
+
 from __future__ import annotations
 
 import argparse
@@ -23,13 +24,20 @@ ERRORS = (DataError, RecipeError, TrainingError, ModelError, LayoutError)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("data", metavar="DATA", help="npz with W (F,2,P) and optional visible (F,P), or a bag of 2D keypoints")
+    parser.add_argument(
+        "data", metavar="DATA", help="npz with W (F,2,P) and optional visible (F,P), or a bag of 2D keypoints"
+    )
     parser.add_argument("-o", "--output", metavar="MODEL", required=True, type=Path, help="model file to write (.npz)")
-    parser.add_argument("--layout", default="coco17", help="layout of the points: a shipped name or a YAML file (default: %(default)s)")
+    parser.add_argument(
+        "--layout", default="coco17", help="layout of the points: a shipped name or a YAML file (default: %(default)s)"
+    )
     parser.add_argument("--topic", help="topic of a bag, where it has several with 2D keypoints")
-    parser.add_argument("--recipe", default="default",
-                        help=f"one of {', '.join(recipe_names())}, or a YAML file (default: %(default)s)")
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe")
+    parser.add_argument(
+        "--recipe", default="default", help=f"one of {', '.join(recipe_names())}, or a YAML file (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe"
+    )
     parser.add_argument("--fresh", action="store_true", help="start over instead of continuing the run beside MODEL")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
@@ -49,8 +57,11 @@ def run(args: argparse.Namespace) -> int:
     trainer = Trainer(data, recipe, folder)
     resumed = trainer.resume()
     left_out = f", {data.left_out} left out (too few points)" if data.left_out else ""
-    print(f"{len(data.W)} frames of layout {data.layout.name} from {data.source}{left_out}"
-          + (f"; continuing at step {trainer.step}" if resumed else ""), file=sys.stderr)
+    print(
+        f"{len(data.W)} frames of layout {data.layout.name} from {data.source}{left_out}"
+        + (f"; continuing at step {trainer.step}" if resumed else ""),
+        file=sys.stderr,
+    )
     try:
         _watch(trainer, args.quiet)
     except KeyboardInterrupt:
@@ -69,14 +80,17 @@ def _watch(trainer: Trainer, quiet: bool) -> None:
 
 
 def _command() -> str:
-    return " ".join(["paul", *sys.argv[1:]])
+    """The command as typed, with bare file names: folders of one machine are no provenance."""
+    return " ".join(["paul", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
 
 
 def _report(header: dict, args: argparse.Namespace) -> None:
     training, metres = header["training"], header["metres_per_unit"]
-    print(f"{args.output}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
-          f"reconstruction loss {training['final']['recon_ad']:.4f}\n"
-          f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}\n"
-          f"  chirality: {'known' if header['chirality']['known'] else 'UNKNOWN'}, {header['chirality']['source']}")
+    print(
+        f"{args.output}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
+        f"reconstruction loss {training['final']['recon_ad']:.4f}\n"
+        f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}\n"
+        f"  chirality: {'known' if header['chirality']['known'] else 'UNKNOWN'}, {header['chirality']['source']}"
+    )
     if args.json:
         write_atomically(args.json, json.dumps(header, indent=1).encode())

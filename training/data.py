@@ -3,6 +3,7 @@
 
 Ground truth may lie in the same file; it is never opened here.
 """
+
 from __future__ import annotations
 
 import hashlib
@@ -14,10 +15,14 @@ import numpy as np
 
 import msg_adapters
 from paul_ros.model import min_visible
+from paul_ros.placement import centred_view
 from paul_ros.skeleton import Layout
 
 ABSURD = 1e6
 """Coordinates beyond this are no pixels: they would only drown the rest in rounding error."""
+
+RAY_LIMIT = 20.0
+"""No camera sees rays of x/z beyond this."""
 
 
 class DataError(ValueError):
@@ -32,6 +37,7 @@ class TrainingData:
         W: (F,2,P) float32 image points, any unit, y down; 0 where hidden.
         visible: (F,P) bool.
         layout: the keypoints.
+        calibrated: W are rays, (x/z, y/z) of a pinhole camera turned to the object; else pixels or any unit.
         source: file name, for provenance.
         left_out: frames that held fewer visible points than can be lifted.
     """
@@ -39,6 +45,7 @@ class TrainingData:
     W: np.ndarray
     visible: np.ndarray
     layout: Layout
+    calibrated: bool
     source: str
     left_out: int
 
@@ -54,8 +61,9 @@ def load_training_data(path: str | Path, layout: Layout, topic: str | None = Non
     """Read 2D keypoints to train on.
 
     Args:
-        path: an ``.npz`` with ``W`` (F,2,P) and optionally ``visible`` (F,P) or NaN where hidden; or a bag (an
-            ``.mcap`` or a rosbag2 folder) with one topic of 2D keypoints of any message type that has an adapter.
+        path: an ``.npz`` with ``W`` (F,2,P) and optionally ``visible`` (F,P) (or NaN where hidden) and ``calibrated``
+            (one bool: W are rays); or a bag (an ``.mcap`` or a rosbag2 folder) with one topic of 2D keypoints of any
+            message type that has an adapter, calibrated where it holds a CameraInfo.
         layout: what the points are.
         topic: which topic of a bag; needed only where it has several.
 
@@ -67,63 +75,84 @@ def load_training_data(path: str | Path, layout: Layout, topic: str | None = Non
     if not path.exists():
         raise DataError(f"no data at '{path}'")
     reader = _read_npz if path.suffix == ".npz" else _read_bag
-    W, visible = reader(path, layout, topic)
-    return _checked(W, visible, layout, path)
+    W, visible, calibrated = reader(path, layout, topic)
+    return _checked(W, visible, layout, calibrated, path)
 
 
-def _read_npz(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray, np.ndarray]:
+def _read_npz(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray, np.ndarray, bool]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             if "W" not in archive.files:
                 raise DataError(f"'{path}' has no array W (F,2,P); it has {', '.join(archive.files) or 'none'}")
             W = archive["W"]
             visible = archive["visible"] if "visible" in archive.files else None
+            calibrated = "calibrated" in archive.files and bool(archive["calibrated"].all())
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"'{path}' is no npz file of plain arrays: {error}") from error
     if W.ndim != 3 or W.shape[1:] != (2, len(layout.names)) or W.dtype.kind not in "fiu":
-        raise DataError(f"W in '{path}' must be numbers (F,2,{len(layout.names)}) for layout '{layout.name}', it is "
-                        f"{W.dtype} {W.shape}: name the right layout with --layout")
+        raise DataError(
+            f"W in '{path}' must be numbers (F,2,{len(layout.names)}) for layout '{layout.name}', it is "
+            f"{W.dtype} {W.shape}: name the right layout with --layout"
+        )
     if visible is None:
         visible = np.ones((len(W), W.shape[2]), bool)
     if visible.shape != (len(W), W.shape[2]):
         raise DataError(f"visible in '{path}' must be {(len(W), W.shape[2])} to go with W, it is {visible.shape}")
-    return W, visible.astype(bool)
+    return W, visible.astype(bool), calibrated
 
 
-def _read_bag(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray, np.ndarray]:
-    from paul_ros.bag import read_messages  # needs the extra "bags"
-
-    frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
-    refused = ""
-    for name, type_name, message, _ in read_messages(path, None if topic is None else {topic}):
-        if type_name not in msg_adapters.SUPPORTED:
-            continue
-        try:
-            frames.setdefault(name, []).append(msg_adapters.read(type_name, message, len(layout.names)))
-        except msg_adapters.MessageError as error:
-            refused = f"; the last message refused on {name}: {error}"
+def _read_bag(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray, np.ndarray, bool]:
+    frames, camera, refused = _bag_keypoints(path, layout, topic)
     if not frames:
-        raise DataError(f"'{path}' holds no 2D keypoints of layout '{layout.name}'"
-                        f"{f' on topic {topic}' if topic else ''}{refused}")
+        raise DataError(
+            f"'{path}' holds no 2D keypoints of layout '{layout.name}'{f' on topic {topic}' if topic else ''}{refused}"
+        )
     if len(frames) > 1:
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
     (seen,) = frames.values()
-    xy = np.concatenate([frame.xy for frame in seen])
-    return xy.transpose(0, 2, 1), np.concatenate([frame.visible for frame in seen])
+    xy, visible = np.concatenate([frame.xy for frame in seen]), np.concatenate([frame.visible for frame in seen])
+    if camera is None:
+        return xy.transpose(0, 2, 1), visible, False
+    some = visible.any(1)
+    return centred_view(xy[some], visible[some], camera).W, visible[some], True
 
 
-def _checked(W: np.ndarray, visible: np.ndarray, layout: Layout, path: Path) -> TrainingData:
+def _bag_keypoints(
+    path: Path, layout: Layout, topic: str | None
+) -> tuple[dict[str, list[msg_adapters.Keypoints2D]], msg_adapters.Intrinsics | None, str]:
+    """Keypoint messages by topic, the last usable camera, and why the last refused message was."""
+    from paul_ros.bag import read_messages  # needs the extra "bags"
+
+    frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
+    camera, refused = None, ""
+    for name, type_name, message, _ in read_messages(path):
+        try:
+            if type_name == "sensor_msgs/msg/CameraInfo":
+                camera = msg_adapters.read_camera_info(message)
+            elif type_name in msg_adapters.SUPPORTED and topic in (None, name):
+                frames.setdefault(name, []).append(msg_adapters.read(type_name, message, len(layout.names)))
+        except msg_adapters.MessageError as error:
+            refused = f"; the last message refused on {name}: {error}"
+    return frames, camera, refused
+
+
+def _checked(W: np.ndarray, visible: np.ndarray, layout: Layout, calibrated: bool, path: Path) -> TrainingData:
     visible = visible & np.isfinite(W).all(1)
-    if np.abs(W.transpose(0, 2, 1)[visible]).max(initial=0) > ABSURD:
-        raise DataError(f"'{path}' has image points beyond {ABSURD:g}: no pixels; mark missing points as hidden or NaN")
+    if np.abs(W.transpose(0, 2, 1)[visible]).max(initial=0) > (RAY_LIMIT if calibrated else ABSURD):
+        raise DataError(
+            f"'{path}' has image points beyond {RAY_LIMIT if calibrated else ABSURD:g}: no "
+            f"{'rays' if calibrated else 'pixels'}; mark missing points as hidden or NaN"
+        )
     enough = (visible.sum(1) >= min_visible(len(layout.names))) & (_spread(W, visible) > 0)
     if not enough.any():
-        raise DataError(f"none of the {len(W)} frames in '{path}' has {min_visible(len(layout.names))} visible points "
-                        f"at different places: nothing to train on")
+        raise DataError(
+            f"none of the {len(W)} frames in '{path}' has {min_visible(len(layout.names))} visible points "
+            f"at different places: nothing to train on"
+        )
     W = np.where(visible[:, None], W, 0).astype(np.float32)[enough]
-    return TrainingData(W, visible[enough], layout, path.name, int((~enough).sum()))
+    return TrainingData(W, visible[enough], layout, calibrated, path.name, int((~enough).sum()))
 
 
 def _spread(W: np.ndarray, visible: np.ndarray) -> np.ndarray:

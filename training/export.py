@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a finished run to the model file that the robot loads."""
+
 from __future__ import annotations
 
 import platform
@@ -39,11 +40,19 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
         "chirality": _chirality(shapes, layout, recipe.handedness_weight),
         "metres_per_unit": metres_per_unit(shapes, layout, recipe.known_lengths),
         "training": {
-            "data": trainer.data.source, "data_sha256": trainer.data.sha256, "frames": len(trainer.data.W),
-            "command": command, "recipe": recipe.to_dict(), "steps": trainer.step,
-            "seconds": round(trainer.seconds, 1), "final": dict(zip(("loss", "recon_ae", "recon_ad"), _final(trainer))),
-            "versions": {"paul_ros": paul_ros.__version__, "torch": torch.__version__.split("+")[0],
-                         "python": platform.python_version()},
+            "data": trainer.data.source,
+            "data_sha256": trainer.data.sha256,
+            "frames": len(trainer.data.W),
+            "command": command,
+            "recipe": recipe.to_dict(),
+            "steps": trainer.step,
+            "seconds": round(trainer.seconds, 1),
+            "final": dict(zip(("loss", "recon_ae", "recon_ad"), _final(trainer))),
+            "versions": {
+                "paul_ros": paul_ros.__version__,
+                "torch": torch.__version__.split("+")[0],
+                "python": platform.python_version(),
+            },
         },
     }
     save_model(path, header, {**_weights(trainer), "mean_shape": mean_shape(shapes)})
@@ -52,8 +61,11 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
 
 def _weights(trainer: Trainer) -> dict[str, np.ndarray]:
     """What runs on the robot: h and f_d, under the names that ``paul_ros.model`` gives them."""
-    return {name: value.numpy() for name, value in trainer.networks.state_dict().items()
-            if not name.startswith("shape_encoder.")}
+    return {
+        name: value.numpy()
+        for name, value in trainer.networks.state_dict().items()
+        if not name.startswith("shape_encoder.")
+    }
 
 
 def _final(trainer: Trainer) -> tuple[float, ...]:
@@ -66,10 +78,16 @@ def _chirality(shapes: np.ndarray, layout: Layout, weight: float) -> dict:
     """Which of the two mirror images the model's shapes are, and how that is known."""
     share = rule_share(shapes, layout)
     if share is None:
-        return {"known": False, "source": "orthographic views alone leave the mirror image open; "
-                                          "give the layout a handedness rule to settle it"}
-    return {"known": share > 0.5, "source": f"handedness rule of layout '{layout.name}', training weight {weight:g}",
-            "training_share": round(share, 4)}
+        return {
+            "known": False,
+            "source": "orthographic views alone leave the mirror image open; "
+            "give the layout a handedness rule to settle it",
+        }
+    return {
+        "known": share > 0.5,
+        "source": f"handedness rule of layout '{layout.name}', training weight {weight:g}",
+        "training_share": round(share, 4),
+    }
 
 
 def mean_shape(shapes: np.ndarray) -> np.ndarray:
@@ -91,6 +109,7 @@ def metres_per_unit(shapes: np.ndarray, layout: Layout, known_lengths: tuple) ->
     if not known_lengths:
         return None
     index = {name: i for i, name in enumerate(layout.names)}
-    model = [np.median(np.linalg.norm(shapes[:, :, index[a]] - shapes[:, :, index[b]], axis=1))
-             for a, b, _ in known_lengths]
+    model = [
+        np.median(np.linalg.norm(shapes[:, :, index[a]] - shapes[:, :, index[b]], axis=1)) for a, b, _ in known_lengths
+    ]
     return float(sum(metres for _, _, metres in known_lengths) / sum(model))

@@ -3,6 +3,7 @@
 
 Parameter names are those of the model file, so that the trained encoder and decoder are exported as they are.
 """
+
 from __future__ import annotations
 
 import torch

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recipe: every setting of a training run, in one YAML file."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -32,6 +33,9 @@ class Recipe:
     bone_weight: float = 1.0  # beyond the paper: edges of the layout keep their lengths
     roll: float = 0.3  # radians; in-plane turns of W, an exact augmentation under an orthographic camera
     mirror_view: bool = True  # x-mirrored W is the same shape seen from behind: exact too
+    fade: tuple[float, float] = (1.0, 1.0)  # shares of the run between which roll and mirror_view fade out: where
+    # cameras stand upright, gravity tells a stoop from a view from above, and turned images blur that
+    perspective: bool = True  # beyond the paper: calibrated data is fitted by a pinhole camera
     mirror_object: bool = False  # left and right exchanged: only for objects that are symmetric
     hide: float = 0.0  # up to this share of a frame's points is hidden anew at every step
     known_lengths: tuple[tuple[str, str, float], ...] = ()  # (point, point, metres): sets the metres per model unit
@@ -64,13 +68,19 @@ class Recipe:
         for name in ("bottleneck", "width", "blocks", "steps", "batch", "learning_rate"):
             if getattr(self, name) <= 0:
                 raise RecipeError(f"recipe setting {name} must be positive, it is {getattr(self, name)}")
+        if not 0 <= self.fade[0] <= self.fade[1] or len(self.fade) != 2:
+            raise RecipeError(f"recipe setting fade must be two growing shares, it is {list(self.fade)}")
         if not 0 <= self.hide < 1:
             raise RecipeError(f"recipe setting hide must be in [0, 1), it is {self.hide}")
 
     def to_dict(self) -> dict:
         """Plain lists and numbers, for YAML and the model's header."""
-        return {key: [list(item) if isinstance(item, tuple) else item for item in value] if isinstance(value, tuple)
-                else value for key, value in dataclasses.asdict(self).items()}
+        return {
+            key: [list(item) if isinstance(item, tuple) else item for item in value]
+            if isinstance(value, tuple)
+            else value
+            for key, value in dataclasses.asdict(self).items()
+        }
 
 
 def recipe_names() -> list[str]:

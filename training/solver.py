@@ -6,6 +6,7 @@ own solver - then Newton steps on the viewing direction up to the optimum, where
 the last step is recorded by autograd: at an optimum the derivative of one Newton step is the derivative of the
 optimum itself (implicit function theorem), so the gradients of R and scale are exact at the price of one step.
 """
+
 from __future__ import annotations
 
 import torch
@@ -19,7 +20,7 @@ _RIDGE = 1e-4  # of the shape's size: keeps flat shapes solvable
 def centre(X: Tensor, visible: Tensor) -> Tensor:
     """Points (N,D,P) minus the mean of the visible ones (N,P): the adaptive normalisation of section 4.3.
 
-    The paper's printed line lacks the factor 1/v (v visible points) that its derivation gives; this is the derived form.
+    The printed line lacks the factor 1/v (v visible points) that its derivation gives; this is the derived form.
     """
     seen = visible[:, None].to(X.dtype)
     return X - (X * seen).sum(2, keepdim=True) / seen.sum(2, keepdim=True)
@@ -68,7 +69,7 @@ def _algebraic_direction(A: Tensor, B: Tensor) -> Tensor:
 
 
 def _newton_step(A: Tensor, B: Tensor, n: Tensor) -> Tensor:
-    """Newton step (N,3) in the tangent plane of n towards a maximum of the free-scale goal g(n) = T / (tr A - n.A n)."""
+    """Newton step (N,3), tangent to n, towards a maximum of the free-scale goal g(n) = T / (tr A - n.A n)."""
     c, D = torch.linalg.cross(B[:, 0], B[:, 1]), B.transpose(1, 2) @ B
     trace_A, trace_D = (X.diagonal(dim1=1, dim2=2).sum(1) for X in (A, D))
     An, Dn = _times(A, n), _times(D, n)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The training loop: minibatches of 2D frames in, a checkpoint and a log out; resumable to the bit."""
+
 from __future__ import annotations
 
 import csv
@@ -17,7 +18,7 @@ from paul_ros.model import min_visible, normalise, write_atomically
 from paul_ros.skeleton import Layout
 from training.data import TrainingData
 from training.networks import Paul
-from training.objective import Terms, paul_terms
+from training.objective import Terms, Views, paul_terms
 from training.recipe import Recipe
 
 LOG_COLUMNS = ("step", "seconds", "loss", "recon_ae", "recon_ad", "code", "handedness", "bones", "learning_rate")
@@ -46,7 +47,7 @@ class Trainer:
             self.networks = Paul(data.layout, recipe.bottleneck, list(recipe.hidden), recipe.width, recipe.blocks)
         self.optimizer = torch.optim.Adam(self.networks.parameters(), lr=recipe.learning_rate, fused=True)
         self.step, self.seconds, self.rows = 0, 0.0, []
-        self._W = torch.from_numpy(normalise(data.W, data.visible).astype(np.float32))
+        self._W = torch.from_numpy(data.W)
         self._visible = torch.from_numpy(data.visible)
         self._mirror = torch.tensor(data.layout.mirror)
 
@@ -73,8 +74,9 @@ class Trainer:
         except TrainingError:
             raise
         except Exception as error:  # torch reports damage in many ways
-            raise TrainingError(f"checkpoint '{self.checkpoint}' cannot be read ({type(error).__name__}): "
-                                f"start over with --fresh") from error
+            raise TrainingError(
+                f"checkpoint '{self.checkpoint}' cannot be read ({type(error).__name__}): start over with --fresh"
+            ) from error
         return True
 
     def run(self) -> Iterator[dict[str, float]]:
@@ -99,11 +101,18 @@ class Trainer:
     def save(self) -> None:
         """Write checkpoint and log, each atomically."""
         buffer = io.BytesIO()
-        torch.save({
-            "identity": self._identity(), "networks": self.networks.state_dict(), "step": self.step,
-            "optimizer": self.optimizer.state_dict(), "generator": self.generator.get_state(),
-            "seconds": self.seconds, "rows": [list(row) for row in self.rows],
-        }, buffer)
+        torch.save(
+            {
+                "identity": self._identity(),
+                "networks": self.networks.state_dict(),
+                "step": self.step,
+                "optimizer": self.optimizer.state_dict(),
+                "generator": self.generator.get_state(),
+                "seconds": self.seconds,
+                "rows": [list(row) for row in self.rows],
+            },
+            buffer,
+        )
         write_atomically(self.checkpoint, buffer.getvalue())
         log = io.StringIO()
         csv.writer(log).writerows([LOG_COLUMNS, *self.rows])
@@ -114,11 +123,13 @@ class Trainer:
         rate = self._learning_rate()
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        terms = paul_terms(self.networks, self.data.layout, *self._batch())
+        terms = paul_terms(self.networks, self.data.layout, self._batch())
         loss = self._loss(terms)
         if not torch.isfinite(loss):
-            raise TrainingError(f"the loss is {loss.item()} at step {self.step}: lower learning_rate in the recipe, "
-                                f"and look for frames with wrong points in '{self.data.source}'")
+            raise TrainingError(
+                f"the loss is {loss.item()} at step {self.step}: lower learning_rate in the recipe, "
+                f"and look for frames with wrong points in '{self.data.source}'"
+            )
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.networks.parameters(), _GRADIENT_LIMIT)
@@ -134,16 +145,22 @@ class Trainer:
     def _loss(self, terms: Terms) -> Tensor:
         recipe = self.recipe
         decay = sum(weight.square().sum() for weight in self.networks.decoder.parameters())
-        return (terms.recon_ae + terms.recon_ad + recipe.code_weight * terms.code + recipe.decay_weight * decay
-                + recipe.handedness_weight * terms.handedness + recipe.bone_weight * terms.bones)
+        return (
+            terms.recon_ae
+            + terms.recon_ad
+            + recipe.code_weight * terms.code
+            + recipe.decay_weight * decay
+            + recipe.handedness_weight * terms.handedness
+            + recipe.bone_weight * terms.bones
+        )
 
     def _learning_rate(self) -> float:
         warm_up = min(1.0, (self.step + 1) / _WARM_UP_STEPS)
         cosine = 0.5 * (1 + np.cos(np.pi * self.step / self.recipe.steps))
         return float(self.recipe.learning_rate * warm_up * cosine)
 
-    def _batch(self) -> tuple[Tensor, Tensor]:
-        """Random frames (W, visible), each seen anew: turned, mirrored and with more points hidden."""
+    def _batch(self) -> Views:
+        """Random frames, each seen anew: turned, mirrored and with more points hidden."""
         recipe, size = self.recipe, self.recipe.batch
         rows = torch.randint(len(self._W), (size,), generator=self.generator)
         W, visible = self._W[rows], self._visible[rows]
@@ -151,43 +168,51 @@ class Trainer:
             chosen = self._uniform(size) < 0.5
             W = torch.where(chosen[:, None, None], W[:, :, self._mirror] * torch.tensor([-1.0, 1.0])[:, None], W)
             visible = torch.where(chosen[:, None], visible[:, self._mirror], visible)
-        W = self._turns(size) @ W
         if recipe.hide:
             fewer = visible & (self._uniform(size, visible.shape[1]) >= recipe.hide * self._uniform(size, 1))
             enough = fewer.sum(1) >= min_visible(visible.shape[1])
             visible = torch.where(enough[:, None], fewer, visible)
-        return normalise_batch(W, visible), visible
+        turn, facing = self._turns(size)
+        return Views.of(turn @ W, visible, facing, self.data.calibrated and recipe.perspective)
 
-    def _turns(self, size: int) -> Tensor:
-        """Random in-plane turns (N,2,2), half of them mirrored in x where the recipe says so."""
-        angle = (2 * self._uniform(size) - 1) * self.recipe.roll
+    def _turns(self, size: int) -> tuple[Tensor, Tensor]:
+        """Random in-plane turns (N,2,2), half of them mirrored in x where the recipe says so; (N,1,1) is -1 for those.
+
+        Both fade during the run as the recipe says.
+        """
+        strength = self._strength()
+        angle = (2 * self._uniform(size) - 1) * self.recipe.roll * strength
         cos, sin = angle.cos(), angle.sin()
         turn = torch.stack([torch.stack([cos, -sin], 1), torch.stack([sin, cos], 1)], 1)
-        if self.recipe.mirror_view:
-            turn[:, 0] *= torch.where(self._uniform(size) < 0.5, -1.0, 1.0)[:, None]
-        return turn
+        mirrored = self._uniform(size) < (0.5 * strength if self.recipe.mirror_view else 0.0)
+        facing = torch.where(mirrored, -1.0, 1.0)[:, None]
+        turn[:, 0] *= facing
+        return turn, facing[:, None]
+
+    def _strength(self) -> float:
+        """Of the view augmentations: 1 before the fade, 0 after it."""
+        begin, end = self.recipe.fade
+        done = self.step / self.recipe.steps
+        return 1.0 if done < begin else max(0.0, (end - done) / (end - begin))
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(shape, generator=self.generator)
 
     def _identity(self) -> dict[str, str]:
         """What a checkpoint belongs to."""
-        return {"data": self.data.sha256, "recipe": repr(sorted(self.recipe.to_dict().items())),
-                "layout": repr(sorted(self.data.layout.to_dict().items(), key=lambda item: item[0]))}
+        return {
+            "data": self.data.sha256,
+            "recipe": repr(sorted(self.recipe.to_dict().items())),
+            "layout": repr(sorted(self.data.layout.to_dict().items(), key=lambda item: item[0])),
+        }
 
     def _check_identity(self, identity: dict[str, str]) -> None:
         other = [name for name, value in self._identity().items() if identity.get(name) != value]
         if other:
-            raise TrainingError(f"'{self.folder}' holds a run with another {' and '.join(other)}: "
-                                f"start over with --fresh, or choose another output")
-
-
-def normalise_batch(W: Tensor, visible: Tensor) -> Tensor:
-    """The torch twin of ``paul_ros.model.normalise``."""
-    seen = visible[:, None].to(W.dtype)
-    count = seen.sum(2, keepdim=True)
-    W = (W - (W * seen).sum(2, keepdim=True) / count) * seen
-    return W / (W.square().sum((1, 2), keepdim=True) / count).sqrt().clamp_min(1e-9)
+            raise TrainingError(
+                f"'{self.folder}' holds a run with another {' and '.join(other)}: "
+                f"start over with --fresh, or choose another output"
+            )
 
 
 def use_threads(count: int | None) -> None:
@@ -210,7 +235,15 @@ def rule_share(shapes: np.ndarray, layout: Layout) -> float | None:
     keeps = np.ones(len(shapes), bool)
     for rule in layout.handedness:
         middle = {part: shapes[:, :, list(points)].mean(2) for part, points in vars(rule).items()}
-        volume = np.linalg.det(np.stack([middle["left"] - middle["right"], middle["above"] - middle["below"],
-                                         middle["front"] - middle["behind"]], axis=1))
+        volume = np.linalg.det(
+            np.stack(
+                [
+                    middle["left"] - middle["right"],
+                    middle["above"] - middle["below"],
+                    middle["front"] - middle["behind"],
+                ],
+                axis=1,
+            )
+        )
         keeps &= volume > 0
     return float(keeps.mean())
