@@ -106,7 +106,7 @@ def test_fault_of_the_program_is_not_hidden(monkeypatch):
     "thing, expected",
     [
         ("coco17", {"kind": "layout", "points": 17}),
-        (ONE, {"kind": "bag", "messages": 1677, "damage": None}),
+        (ONE, {"kind": "bag", "messages": 1755, "damage": None}),
         ("MODEL", {"kind": "model", "name": "stand", "layout": "coco17", "bottleneck": 2}),
     ],
 )

@@ -4,14 +4,18 @@
 import argparse
 import csv
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from paul_ros.bag import BagWriter, read_records
 from paul_ros.model import load_model
 from paul_ros.onp import onp
+from paul_ros.replay import open_stream, replay
 from paul_ros.skeleton import load_layout
 from training import cli, human_data
 from training.data import DataError, load_training_data
@@ -283,6 +287,11 @@ def test_bad_recipes_are_refused(override, message):
         Recipe.load("default", [override])
 
 
+def test_lengths_between_unknown_points_are_refused_before_training(data_file, tmp_path):
+    with pytest.raises(RecipeError, match="left_hoof"):
+        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", "known_lengths=[[left_hip, left_hoof, 0.4]]")
+
+
 def test_shipped_recipes_load():
     assert {"default", "human"} <= set(recipe_names())
     for name in recipe_names():
@@ -338,3 +347,36 @@ def test_cameras_keep_people_upright():
     np.testing.assert_allclose(np.linalg.det(R), 1)
     assert (R[:, 1, 1] < 0).all()  # world up is image up: y down in the image
     assert len(CMU31) == 31
+
+
+# --- the journey: record, train, lift
+
+
+def test_a_bag_is_learned_from_and_lifted_with(tmp_path):
+    bag = Path(__file__).parents[1] / "bags" / "one_person.mcap"
+    data = load_training_data(bag, COCO)
+    assert data.calibrated and len(data.W) == 585 and np.abs(data.W).max() < 1
+    train(bag, "-o", tmp_path / "mine.npz", *SMALL)
+    stream = open_stream(str(tmp_path / "mine.npz"))
+    done = replay(bag, stream)
+    assert stream.counts["lifted"] == 585 and stream.units == "model"
+    assert np.isfinite(done.frames[0].lifted.points).all()
+
+
+def test_a_bag_in_another_layout_says_which_would_fit(tmp_path):
+    bag = Path(__file__).parents[1] / "bags" / "one_person.mcap"
+    with pytest.raises(DataError, match="no 2D keypoints of layout 'body25'.*17 keypoints"):
+        load_training_data(bag, load_layout("body25"))
+
+
+def test_of_several_topics_one_must_be_chosen(tmp_path):
+    """The truth in our bags is a PoseArray too, but in 3D; a second topic of 2D keypoints leaves a choice."""
+    bag = Path(__file__).parents[1] / "bags" / "one_person.mcap"
+    with BagWriter(tmp_path / "two.mcap") as out:
+        for record in read_records(bag, {"/keypoints"}):
+            out.write_record(record)
+            out.write_record(replace(record, topic="/other"))
+    with pytest.raises(DataError, match="/keypoints, /other.*--topic"):
+        load_training_data(tmp_path / "two.mcap", COCO)
+    data = load_training_data(tmp_path / "two.mcap", COCO, "/other")
+    assert not data.calibrated and np.abs(data.W).max() > 100

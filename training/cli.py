@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 from pathlib import Path
 
+import torch
 from tqdm import tqdm
 
 from paul_ros.model import ModelError, write_atomically
@@ -16,7 +16,7 @@ from paul_ros.skeleton import LayoutError, load_layout
 from training.data import DataError, load_training_data
 from training.export import export_model
 from training.recipe import Recipe, RecipeError, recipe_names
-from training.trainer import Trainer, TrainingError, use_threads
+from training.trainer import Trainer, TrainingError
 
 ERRORS = (DataError, RecipeError, TrainingError, ModelError, LayoutError)
 """What a user can cause and mend; the text of each is one clear line."""
@@ -39,7 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe"
     )
     parser.add_argument("--fresh", action="store_true", help="start over instead of continuing the run beside MODEL")
-    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (default: all cores)")
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="CPU threads; the networks are small: more gain little, and lose much on a busy machine (default: 1)",
+    )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -50,10 +56,12 @@ def run(args: argparse.Namespace) -> int:
         raise DataError(f"the model file must end in .npz, not '{args.output.name}'")
     recipe = Recipe.load(args.recipe, args.set)
     data = load_training_data(args.data, load_layout(args.layout), args.topic)
+    recipe.check_points(data.layout)
     folder = args.output.with_suffix(".run")
     if args.fresh:
-        shutil.rmtree(folder, ignore_errors=True)
-    use_threads(args.threads)
+        for file in folder.glob("*"):
+            file.unlink()
+    torch.set_num_threads(max(1, args.threads))
     trainer = Trainer(data, recipe, folder)
     resumed = trainer.resume()
     left_out = f", {data.left_out} left out (too few points)" if data.left_out else ""
@@ -72,11 +80,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _watch(trainer: Trainer, quiet: bool) -> None:
-    with tqdm(total=trainer.recipe.steps, initial=trainer.step, unit="step", disable=quiet, dynamic_ncols=True) as bar:
+    # Into a log file, a line twice a minute.
+    interval = 0.1 if sys.stderr.isatty() else 30.0
+    steps, begun = trainer.recipe.steps, trainer.step
+    with tqdm(total=steps, initial=begun, unit="step", disable=quiet, mininterval=interval, dynamic_ncols=True) as bar:
         for row in trainer.run():
             bar.update()
             if row["step"] % 20 == 0:
-                bar.set_postfix(loss=f"{row['loss']:.4f}", ae=f"{row['recon_ae']:.4f}", ad=f"{row['recon_ad']:.4f}")
+                losses = {"loss": row["loss"], "ae": row["recon_ae"], "ad": row["recon_ad"]}
+                bar.set_postfix({name: f"{value:.4f}" for name, value in losses.items()}, refresh=False)
 
 
 def _command() -> str:

@@ -132,7 +132,9 @@ def _bag_keypoints(
             if type_name == "sensor_msgs/msg/CameraInfo":
                 camera = msg_adapters.read_camera_info(message)
             elif type_name in msg_adapters.SUPPORTED and topic in (None, name):
-                frames.setdefault(name, []).append(msg_adapters.read(type_name, message, len(layout.names)))
+                seen = msg_adapters.read(type_name, message, len(layout.names))
+                if seen.persons:
+                    frames.setdefault(name, []).append(seen)
         except msg_adapters.MessageError as error:
             refused = f"; the last message refused on {name}: {error}"
     return frames, camera, refused

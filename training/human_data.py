@@ -60,11 +60,7 @@ def training_clips(clips: list[tuple[str, np.ndarray]]) -> list[tuple[str, np.nd
     """The clips that are neither held out nor copies of held-out ones under another name."""
     held_out = [joints for name, joints in clips if name.startswith(HELD_OUT)]
     known = np.concatenate([_limb_angles(joints) for joints in held_out])
-    return [
-        (name, joints)
-        for name, joints in clips
-        if not name.startswith(HELD_OUT) and not _is_copy(joints, known)
-    ]
+    return [(name, joints) for name, joints in clips if not name.startswith(HELD_OUT) and not _is_copy(joints, known)]
 
 
 _PARENTS = {"femur": "hipjoint", "tibia": "femur", "humerus": "clavicle", "radius": "humerus"}

@@ -120,7 +120,7 @@ def handedness_violation(S: Tensor, layout: Layout, margin: float = 0.5) -> Tens
 
 
 def bone_variation(S: Tensor, layout: Layout) -> Tensor:
-    """Relative variance of the edge lengths over shapes (N,3,P): bones keep their lengths, and both sides have the same.
+    """Relative variance of edge lengths over shapes (N,3,P): bones keep their lengths, and both sides have the same.
 
     The first keeps depth honest, the second keeps the search out of lopsided solutions that explain the views as well.
     """

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import yaml
 
+from paul_ros.skeleton import Layout
+
 
 class RecipeError(ValueError):
     """A recipe that cannot be used; the text says what to do."""
@@ -72,6 +74,15 @@ class Recipe:
             raise RecipeError(f"recipe setting fade must be two growing shares, it is {list(self.fade)}")
         if not 0 <= self.hide < 1:
             raise RecipeError(f"recipe setting hide must be in [0, 1), it is {self.hide}")
+
+    def check_points(self, layout: Layout) -> None:
+        """Refuse known lengths between points that the layout does not have; raises RecipeError."""
+        for length in self.known_lengths:
+            if len(length) != 3 or not {*length[:2]} <= {*layout.names} or not 0 < length[2] < 1e3:
+                raise RecipeError(
+                    f"known_lengths must be [point, point, metres] with points of layout '{layout.name}', "
+                    f"one is {list(length)}"
+                )
 
     def to_dict(self) -> dict:
         """Plain lists and numbers, for YAML and the model's header."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -213,11 +212,6 @@ class Trainer:
                 f"'{self.folder}' holds a run with another {' and '.join(other)}: "
                 f"start over with --fresh, or choose another output"
             )
-
-
-def use_threads(count: int | None) -> None:
-    """CPU threads for torch; None = all cores."""
-    torch.set_num_threads(count or os.cpu_count() or 1)
 
 
 def predict_shapes(networks: Paul, data: TrainingData, limit: int = 20_000) -> np.ndarray:
