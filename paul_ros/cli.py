@@ -72,9 +72,11 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
 
 def _replay(args: argparse.Namespace) -> None:
     from paul_ros.bag import BagError
-    from paul_ros.replay import Topics, evaluate, open_stream, replay
+    from paul_ros.replay import Topics, evaluate, open_stream, replay, spare
     from paul_ros.report import table, write_json, write_picture
 
+    for output in (args.output, args.json, args.plot):
+        spare(args.bag, output)
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic)
     with Ticker("replay") as tick:
         done = replay(args.bag, open_stream(args.model, args.layout), args.output, topics, tick)

@@ -99,12 +99,13 @@ class Lifter:
             view = centred_view(xy, visible, camera)
             W, turn, pixels = view.W, view.turn, (camera.fx + camera.fy) / 2
             visible = visible & np.isfinite(W).all(1)
+        enough = visible.sum(1) >= self.model.min_visible  # again: points may lie beyond the virtual camera's horizon
         S = self.model.shape(W, visible).astype(float)
         pose = onp(S, W, visible)
         if camera is not None:
             # Once is enough: it leaves half a pixel and 5 mm of a person 2.5 m away, a tenth of that at 6 m.
             pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible, start=pose.R)
-        good = pose.determined & (pose.scale > 0)
+        good = enough & pose.determined & (pose.scale > 0)
         camera_shape = pose.R @ S
         root = list(self.model.layout.root)
         if lifted["units"] == "m":
@@ -122,7 +123,7 @@ class Lifter:
         lifted["reprojection"][rows] = pose.residual[done] * pixels
         lifted["ambiguity"][rows] = pose.ambiguity[done]
         lifted["certified"][rows] = pose.certified[done]
-        return np.where(good, "", DEGENERATE_POINTS)
+        return np.where(good, "", np.where(enough, DEGENERATE_POINTS, TOO_FEW_POINTS))
 
 
 def _nothing(N: int, P: int, units: str) -> dict:

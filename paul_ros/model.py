@@ -161,8 +161,10 @@ def load_model(name_or_path: str | os.PathLike = DEFAULT_MODEL) -> Model:
     try:
         arrays = _read_arrays(data)
         header = json.loads(bytes(arrays.pop("header")).decode())
-    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+    except (KeyError, ValueError, OSError, RecursionError, zipfile.BadZipFile) as error:
         raise ModelError(f"{where} is no model file: {error}") from error
+    if not isinstance(header, dict):
+        raise ModelError(f"{where} is no model file: its header is a {type(header).__name__}, not an object")
     if header.get("format") != FORMAT_VERSION:
         raise ModelError(
             f"{where} has format version {header.get('format')}, this paul_ros reads {FORMAT_VERSION}: "

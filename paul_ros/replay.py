@@ -100,6 +100,16 @@ def open_stream(model: str | None = None, layout: str | None = None) -> LiftStre
     )
 
 
+def spare(bag: Path, output: Path | None) -> None:
+    """Raises BagError where writing the output would overwrite the bag that is read, or a file of it."""
+    if output is None or not bag.exists():
+        return
+    read, written = bag.resolve(), output.resolve()
+    part = read in written.parents and (written.suffix == ".mcap" or written.name == "metadata.yaml")
+    if written == read or part:
+        raise BagError(f"{output}: is {'part of ' if part else ''}the bag that is read; name another output")
+
+
 def replay(
     bag: Path,
     stream: LiftStream,
@@ -112,8 +122,7 @@ def replay(
     A bag damaged somewhere in the middle is lifted up to there: `out` is then whole and says what was read, and the
     result names the damage. Raises BagError where nothing can be read, or nothing there is to be lifted.
     """
-    if out is not None and bag.exists() and out.resolve() == bag.resolve():
-        raise BagError(f"{out}: is the bag that is read; name another output")
+    spare(bag, out)
     done = Replay(bag, stream)
     with BagWriter(out) if out else contextlib.nullcontext() as writer:
         shell = _Shell(done, topics, writer)

@@ -46,6 +46,18 @@ def test_version(capsys):
     assert end.value.code == 0 and capsys.readouterr().out == f"paul_ros {__version__}\n"
 
 
+@pytest.mark.parametrize("option, name", [("-o", "one.mcap"), ("--json", "one.mcap"), ("--plot", "metadata.yaml")])
+@pytest.mark.parametrize("folder", [False, True])
+def test_the_bag_that_is_read_is_never_overwritten(tmp_path, capsys, option, name, folder):
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    for file in ("one.mcap", "metadata.yaml"):
+        (bag / file).write_bytes(b"recorded")
+    assert cli.main(["replay", str(bag if folder else bag / name), option, str(bag / name)]) == 1
+    assert "name another output" in capsys.readouterr().err
+    assert (bag / name).read_bytes() == b"recorded"
+
+
 @pytest.mark.parametrize("arguments", [[], ["dance"], ["replay"], ["replay", "a", "--speed", "2"]])
 def test_wrong_usage(arguments, capsys):
     with pytest.raises(SystemExit) as end:

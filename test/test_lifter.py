@@ -98,6 +98,16 @@ def test_any_subset_of_enough_points_is_lifted_to_finite_points(model, share):
     np.testing.assert_allclose(np.linalg.det(lifted.rotation), 1)
 
 
+def test_points_beyond_the_horizon_do_not_count_as_seen(model):
+    """Seven far to the right, three far to the left: what the virtual camera still sees is fewer than the minimum."""
+    visible = np.arange(17)[None] < model.min_visible + 2
+    xy = np.random.default_rng(0).normal(360, 50, (1, 17, 2))
+    xy[0, :5, 0] = 1e6
+    xy[0, 5:, 0] = -1e6
+    assert np.isfinite(centred_view(xy, visible, CAMERA).W).all(1).sum() < model.min_visible
+    assert Lifter(model).lift(xy, visible, CAMERA).reason == (TOO_FEW_POINTS,)
+
+
 def test_all_points_at_one_pixel_are_refused(model):
     lifted = Lifter(model).lift(np.full((1, 17, 2), 300.0), np.ones((1, 17), bool), CAMERA)
     assert lifted.reason == (DEGENERATE_POINTS,)

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model file: round trip, damage, versions, layouts."""
 
+import hashlib
+import io
 import json
 import subprocess
 import sys
+import zipfile
 
 import numpy as np
 import pytest
@@ -74,6 +77,19 @@ def test_a_truncated_file_is_refused(saved, share):
     data = saved.read_bytes()
     saved.write_bytes(data[: int(share * len(data))])
     with pytest.raises(ModelError, match="model.npz"):
+        load_model(saved)
+
+
+@pytest.mark.parametrize("text", ["[]", "3", "null", "[" * 100_000])
+def test_a_header_that_is_no_object_is_refused(saved, text):
+    """With a checksum that is right: the file is whole, and still no model."""
+    buffer = io.BytesIO()
+    np.savez(buffer, header=np.frombuffer(text.encode(), np.uint8), **arrays())
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.comment = b"0" * 64
+    body = buffer.getvalue()[:-64]
+    saved.write_bytes(body + hashlib.sha256(body).hexdigest().encode())
+    with pytest.raises(ModelError, match="no model file"):
         load_model(saved)
 
 

@@ -218,7 +218,7 @@ def test_the_launch_file_names_what_there_is() -> None:
     assert yaml.safe_load(parameters.read_text())["/**"]["ros__parameters"]
     node_source = (ROOT / "paul_ros/node.py").read_text(encoding="utf-8")
     for remap in node.findall("remap"):
-        assert f"'{remap.get('from')}'" in node_source
+        assert f'"{remap.get("from")}"' in node_source
 
 
 def test_launchers_are_executable_in_git() -> None:

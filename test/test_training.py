@@ -280,11 +280,30 @@ def test_frames_with_too_few_points_are_left_out_and_counted(tmp_path):
         ("batch", "key=value"),
         ("width=-4", "positive"),
         ("hide=1.0", "hide"),
+        ("fade=[1]", "fade"),
+        ("fade=[a, b]", "fade"),
     ],
 )
 def test_bad_recipes_are_refused(override, message):
     with pytest.raises(RecipeError, match=message):
         Recipe.load("default", [override])
+
+
+@pytest.mark.parametrize("fade, strengths", [((0, 0), [0, 0, 0, 0]), ((0.5, 0.5), [1, 1, 0, 0]), ((0, 1), [1, 0.75, 0.5, 0.25])])
+def test_view_augmentation_fades_as_the_recipe_says(data_file, tmp_path, fade, strengths):
+    recipe = Recipe.from_dict({"steps": 4, "width": 16, "batch": 8, "fade": fade})
+    trainer = Trainer(load_training_data(data_file, COCO), recipe, tmp_path / "run")
+    found = []
+    for trainer.step in range(4):
+        found.append(trainer._strength())
+    assert found == strengths
+
+
+def test_the_data_is_never_overwritten_by_the_model(data_file):
+    before = data_file.read_bytes()
+    with pytest.raises(DataError, match="another output"):
+        train(data_file, "-o", data_file, *SMALL)
+    assert data_file.read_bytes() == before
 
 
 def test_lengths_between_unknown_points_are_refused_before_training(data_file, tmp_path):

@@ -54,6 +54,9 @@ def run(args: argparse.Namespace) -> int:
     """Train, or continue, and export. Raises one of ERRORS."""
     if args.output.suffix != ".npz":
         raise DataError(f"the model file must end in .npz, not '{args.output.name}'")
+    for output in filter(None, (args.output, args.json)):
+        if output.resolve() == Path(args.data).resolve():
+            raise DataError(f"'{output}' is the data that is trained on: name another output")
     recipe = Recipe.load(args.recipe, args.set)
     data = load_training_data(args.data, load_layout(args.layout), args.topic)
     recipe.check_points(data.layout)

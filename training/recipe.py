@@ -70,7 +70,8 @@ class Recipe:
         for name in ("bottleneck", "width", "blocks", "steps", "batch", "learning_rate"):
             if getattr(self, name) <= 0:
                 raise RecipeError(f"recipe setting {name} must be positive, it is {getattr(self, name)}")
-        if not 0 <= self.fade[0] <= self.fade[1] or len(self.fade) != 2:
+        numbers = all(type(share) in (int, float) for share in self.fade)
+        if len(self.fade) != 2 or not numbers or not 0 <= self.fade[0] <= self.fade[1]:
             raise RecipeError(f"recipe setting fade must be two growing shares, it is {list(self.fade)}")
         if not 0 <= self.hide < 1:
             raise RecipeError(f"recipe setting hide must be in [0, 1), it is {self.hide}")

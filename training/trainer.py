@@ -192,7 +192,9 @@ class Trainer:
         """Of the view augmentations: 1 before the fade, 0 after it."""
         begin, end = self.recipe.fade
         done = self.step / self.recipe.steps
-        return 1.0 if done < begin else max(0.0, (end - done) / (end - begin))
+        if done < begin:
+            return 1.0
+        return (end - done) / (end - begin) if done < end else 0.0
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(shape, generator=self.generator)
