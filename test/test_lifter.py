@@ -99,7 +99,7 @@ def test_any_subset_of_enough_points_is_lifted_to_finite_points(model, share):
 
 
 def test_points_beyond_the_horizon_do_not_count_as_seen(model):
-    """Seven far to the right, three far to the left: what the virtual camera still sees is fewer than the minimum."""
+    """Five far to the right, three far to the left: the virtual camera sees fewer than the minimum."""
     visible = np.arange(17)[None] < model.min_visible + 2
     xy = np.random.default_rng(0).normal(360, 50, (1, 17, 2))
     xy[0, :5, 0] = 1e6

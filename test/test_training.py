@@ -289,7 +289,9 @@ def test_bad_recipes_are_refused(override, message):
         Recipe.load("default", [override])
 
 
-@pytest.mark.parametrize("fade, strengths", [((0, 0), [0, 0, 0, 0]), ((0.5, 0.5), [1, 1, 0, 0]), ((0, 1), [1, 0.75, 0.5, 0.25])])
+@pytest.mark.parametrize(
+    "fade, strengths", [((0, 0), [0, 0, 0, 0]), ((0.5, 0.5), [1, 1, 0, 0]), ((0, 1), [1, 0.75, 0.5, 0.25])]
+)
 def test_view_augmentation_fades_as_the_recipe_says(data_file, tmp_path, fade, strengths):
     recipe = Recipe.from_dict({"steps": 4, "width": 16, "batch": 8, "fade": fade})
     trainer = Trainer(load_training_data(data_file, COCO), recipe, tmp_path / "run")
