@@ -70,7 +70,11 @@ class Keypoints2D:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera without distortion: focal lengths, principal point and image size, all in pixels."""
+    """A pinhole camera without distortion: focal lengths, principal point and image size, all in pixels.
+
+    matrix: 'P' or 'K', where in CameraInfo they stood: P is of the rectified image, K of the raw one.
+    distorted: they are of a raw image whose distortion is known but not corrected.
+    """
 
     fx: float
     fy: float
@@ -78,6 +82,8 @@ class Intrinsics:
     cy: float
     width: int
     height: int
+    matrix: str = "P"
+    distorted: bool = False
 
 
 def stamp_ns(header) -> int:

@@ -15,6 +15,8 @@ _FLOAT32 = 7
 _SPHERE_LIST, _LINE_LIST = 7, 5
 _ADD, _DELETE = 0, 2
 _MARKER_SECONDS = 1
+#: Up to here float32 holds every whole number.
+_LARGEST_ID = 2**24
 
 #: Colours of the sides as (r, g, b): left red and right green, as on ships.
 SIDE_COLOURS = {"left": (0.9, 0.2, 0.2), "right": (0.2, 0.75, 0.3), "": (0.35, 0.55, 0.95)}
@@ -61,11 +63,12 @@ def skeleton_markers(make, header, points: np.ndarray, observed: np.ndarray, edg
     """visualization_msgs/MarkerArray of all persons: one LINE_LIST (bones), one SPHERE_LIST (keypoints).
 
     points (N, P, 3); observed (N, P) bool, what was not observed is drawn faint; edges: pairs of keypoint
-    indices; sides: P of 'left', 'right', ''; thickness of a bone in the units of the points.
+    indices; sides: P of 'left', 'right', ''; thickness of a bone in the units of the points. A bone has the
+    colour of a side where both its ends are of that side.
     With no person both markers are deleted: viewers complain of empty lists.
     """
     edges = np.asarray(edges, dtype=int).reshape(-1, 2)
-    bone_sides = [sides[a] or sides[b] for a, b in edges]
+    bone_sides = [sides[a] if sides[a] == sides[b] else "" for a, b in edges]
     bones = points[:, edges].reshape(-1, 3)
     bones_seen = observed[:, edges].all(axis=-1).repeat(2)
     palette = _palette(make)
@@ -99,7 +102,10 @@ def id_numbers(ids) -> np.ndarray:
 def _id_number(text: str, row: int) -> int:
     if text == "":
         return -1
-    return int(text) if text.isdecimal() and int(text) <= 2**24 else row
+    digits = text.lstrip("0") or "0"
+    # The length first: Python refuses to read a number of thousands of digits.
+    known = digits.isdecimal() and len(digits) <= len(str(_LARGEST_ID)) and int(digits) <= _LARGEST_ID
+    return int(digits) if known else row
 
 
 def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray]):

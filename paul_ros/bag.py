@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
+import tempfile
 import zlib
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -126,9 +127,10 @@ class BagMessages:
 class BagWriter:
     """Writes one .mcap file (profile ros2, ros2msg schemas, CDR); a context manager.
 
-    The bytes go to `PATH.part`, chunk by chunk, and take the name PATH in one step when the block ends well. A writer
-    that is killed or fails leaves PATH as it was and a `.part` file that `read_messages` (or `mcap recover`)
-    reads up to the last whole chunk. Equal input gives equal bytes. compression: 'zstd', 'lz4' or 'none'.
+    The bytes go to `PATH.part`, chunk by chunk, and take the name PATH in one step when the block ends well. A block
+    that fails leaves PATH as it was and nothing else; a writer that is killed leaves the `.part` file too, which
+    `read_messages` (or `mcap recover`) reads up to the last whole chunk. Equal input gives equal bytes.
+    compression: 'zstd', 'lz4' or 'none'. Entering raises BagError where the file cannot be written.
     """
 
     def __init__(self, path: str | Path, messages: BagMessages | None = None, compression: str = "zstd"):
@@ -144,8 +146,8 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         from mcap.writer import CompressionType, Writer
 
+        check_output(self.path)
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self.part, "wb", buffering=4096)  # a chunk is more, so it reaches the system at once
         except OSError as error:
             raise BagError(f"cannot write {self.path}: {error.strerror}") from error
@@ -185,14 +187,29 @@ class BagWriter:
         return self._channels[record.topic]
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        self._writer.finish()
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        if kind is None:
-            os.replace(self.part, self.path)
-        elif not self.count:
-            self.part.unlink()
+        try:
+            if kind is None:
+                self._writer.finish()
+                self._file.flush()
+                os.fsync(self._file.fileno())
+                os.replace(self.part, self.path)
+        finally:
+            self.part.unlink(missing_ok=True)  # before closing, which on a full disk fails as the writing did
+            self._file.close()
+
+
+def check_output(path: Path) -> None:
+    """Raises BagError where no file can be written at this path, so that nobody waits for one in vain.
+
+    Makes the folder that it is to lie in.
+    """
+    if path.is_dir():
+        raise BagError(f"cannot write {path}: it is a folder; name a file in it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise BagError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _need(module: str) -> None:

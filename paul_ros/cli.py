@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -71,21 +72,24 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
 
 
 def _replay(args: argparse.Namespace) -> None:
-    from paul_ros.bag import BagError
+    from paul_ros.bag import BagError, check_output
     from paul_ros.replay import Topics, evaluate, open_stream, replay, spare
     from paul_ros.report import table, write_json, write_picture
 
-    for output in (args.output, args.json, args.plot):
+    for output in filter(None, (args.output, args.json, args.plot)):
         spare(args.bag, output)
+        check_output(output)
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic)
     with Ticker("replay") as tick:
         done = replay(args.bag, open_stream(args.model, args.layout), args.output, topics, tick)
     report = evaluate(done)
-    print(table(report))
     if args.json:
         write_json(args.json, report)
-    if args.plot:
-        write_picture(args.plot, done)
+    try:
+        if args.plot:
+            write_picture(args.plot, done)
+    finally:
+        print(table(report))  # after the files, for who reads it may stop reading
     if not done.frames:
         raise BagError(f"{args.bag}: no keypoint message could be used: {'; '.join(done.stream.explanations.values())}")
     if done.damage:
@@ -112,9 +116,9 @@ def _inspect(args: argparse.Namespace) -> None:
     from paul_ros.report import write_json
 
     summary, damage = inspect(args.thing)
-    print(as_text(summary))
     if args.json:
         write_json(args.json, summary)
+    print(as_text(summary))
     if damage:
         raise damage
 
@@ -175,10 +179,23 @@ def _use_one_thread() -> None:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Exit code 0 only on success; what a user can cause is one line on stderr and exit code 1."""
-    argv = sys.argv[1:] if argv is None else argv
+    """Exit code 0 only on success; what a user can cause is one line on stderr and exit code 1.
+
+    Where the reader of stdout is gone (`paul ... | head`) it is 141, what a shell says of a process that SIGPIPE ended.
+    """
+    try:
+        try:
+            return _run(sys.argv[1:] if argv is None else argv)
+        finally:
+            print(end="", flush=True)  # here, not at exit, where a closed pipe could no longer be caught
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+
+
+def _run(argv: list[str]) -> int:
     train = argv[:1] == ["train"]
-    if not train:  # training sums over large batches and wants all cores
+    if not train:  # training has --threads for it
         _use_one_thread()
     try:
         args = _parser(train).parse_args(argv)
@@ -186,6 +203,8 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("paul: stopped", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        raise
     except Exception as error:
         if not _is_expected(error):
             raise

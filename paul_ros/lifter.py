@@ -14,9 +14,16 @@ from paul_ros.placement import centred_view, place, undo_perspective
 
 TOO_FEW_POINTS = "too_few_points"
 DEGENERATE_POINTS = "degenerate_points"
+TOO_FAR = "too_far"
 
 AMBIGUOUS = 0.9
 """From this ambiguity on the mirrored pose explains the image nearly as well."""
+
+MIN_EXTENT = 1.0
+"""Pixels, root mean square distance of the visible points from their mean: below it an image says nothing of a pose."""
+
+MAX_DISTANCE = 200.0
+"""Metres: there a grown person's points keep about 1.5 pixels of extent for 900 pixels of focal length."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +39,9 @@ class Lifted:
         reprojection: (N,) pixels, root mean square over the visible points.
         ambiguity: (N,) 0..1, residual of the pose over that of its mirrored rival; 1 means undecidable.
         certified: (N,) the pose is the proven optimum of orthographic-N-point.
-        reason: N slugs, '' where lifted, else why not.
+        reason: N slugs, '' where lifted, else why not: ``too_few_points``, fewer visible than the model asks for;
+            ``degenerate_points``, they fix no pose: all on one line or, with intrinsics, an rms extent below
+            ``MIN_EXTENT``; ``too_far``, in metres a coordinate would exceed ``MAX_DISTANCE``.
         units: ``"m"`` or ``"model"``.
     """
 
@@ -105,17 +114,20 @@ class Lifter:
         if camera is not None:
             # Once is enough: it leaves half a pixel and 5 mm of a person 2.5 m away, a tenth of that at 6 m.
             pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible, start=pose.R)
-        good = enough & pose.determined & (pose.scale > 0)
+        fixed = pose.determined & (pose.scale > 0) & (camera is None or _extent(xy, visible) >= MIN_EXTENT)
+        near = np.ones(len(xy), bool)
         camera_shape = pose.R @ S
         root = list(self.model.layout.root)
         if lifted["units"] == "m":
-            scale = np.where(good, pose.scale, 1.0)
+            scale = np.where(fixed, pose.scale, 1.0)
             points = place(camera_shape, scale, pose.translation, turn, self.model.metres_per_unit)
             rotation = turn @ pose.R
+            near = np.abs(points).max((1, 2)) <= MAX_DISTANCE
         else:
             points = (camera_shape - camera_shape[:, :, root].mean(2, keepdims=True)).transpose(0, 2, 1)
             rotation = pose.R if turn is None else turn @ pose.R
-        done, rows = good, rows[good]
+        done = enough & fixed & near
+        rows = rows[done]
         lifted["points"][rows] = points[done]
         lifted["root"][rows] = points[done][:, root].mean(1)
         lifted["rotation"][rows] = rotation[done]
@@ -123,7 +135,15 @@ class Lifter:
         lifted["reprojection"][rows] = pose.residual[done] * pixels
         lifted["ambiguity"][rows] = pose.ambiguity[done]
         lifted["certified"][rows] = pose.certified[done]
-        return np.where(good, "", np.where(enough, DEGENERATE_POINTS, TOO_FEW_POINTS))
+        return np.select([done, ~enough, ~fixed], ["", TOO_FEW_POINTS, DEGENERATE_POINTS], TOO_FAR)
+
+
+def _extent(xy: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """(N,) root mean square distance of the visible points of (N,P,2) from their mean; 0 where there are none."""
+    seen = visible[..., None]
+    count = np.maximum(visible.sum(1), 1)[:, None]
+    mean = np.where(seen, xy, 0.0).sum(1) / count
+    return np.sqrt((np.where(seen, xy - mean[:, None], 0.0) ** 2).sum((1, 2)) / count[:, 0])
 
 
 def _nothing(N: int, P: int, units: str) -> dict:

@@ -13,7 +13,7 @@ import io
 import json
 import math
 import os
-import tempfile
+import re
 import zipfile
 from dataclasses import dataclass
 from importlib import resources
@@ -21,12 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
+from paul_ros.files import write_atomically
 from paul_ros.skeleton import Layout, LayoutError
 
 FORMAT_VERSION = 1
 DEFAULT_MODEL = "human_coco17"
 _DIGEST_CHARS = 64
 _MAX_BYTES = 64 * 2**20
+_MAX_LAYERS = 100
 
 
 class ModelError(ValueError):
@@ -149,12 +151,15 @@ def load_model(name_or_path: str | os.PathLike = DEFAULT_MODEL) -> Model:
     Raises:
         ModelError: no such model; damaged; of another format version; not a model file.
     """
-    path = _find(name_or_path)
-    data = path.read_bytes()
+    try:
+        path = _find(name_or_path)
+        data = path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"model '{name_or_path}' cannot be read: {error.strerror}") from error
     name = Path(path.name).stem
     where = f"model file '{name_or_path}'"
-    if len(data) <= _DIGEST_CHARS or not data.startswith(b"PK"):
-        raise ModelError(f"{where} is no model file (expected the .npz that `paul train` writes)")
+    if not data.startswith(b"PK") or not re.fullmatch(rb"[0-9a-f]{%d}" % _DIGEST_CHARS, data[-_DIGEST_CHARS:]):
+        raise ModelError(f"{where} is no model file, or is cut off (expected the .npz that `paul train` writes)")
     digest = hashlib.sha256(data[:-_DIGEST_CHARS]).hexdigest()
     if data[-_DIGEST_CHARS:] != digest.encode():
         raise ModelError(f"{where} is damaged (its checksum does not match): copy it again or export it anew")
@@ -165,14 +170,14 @@ def load_model(name_or_path: str | os.PathLike = DEFAULT_MODEL) -> Model:
         raise ModelError(f"{where} is no model file: {error}") from error
     if not isinstance(header, dict):
         raise ModelError(f"{where} is no model file: its header is a {type(header).__name__}, not an object")
-    if header.get("format") != FORMAT_VERSION:
+    if header.get("format") is True or header.get("format") != FORMAT_VERSION:
         raise ModelError(
             f"{where} has format version {header.get('format')}, this paul_ros reads {FORMAT_VERSION}: "
             f"export it anew with `paul train`, or install the paul_ros that wrote it"
         )
     try:
         layout = Layout.from_dict(header["layout"])
-        _check_arrays(header, layout, arrays)
+        _check(header, layout, arrays)
     except (KeyError, TypeError, ValueError, LayoutError) as error:
         raise ModelError(f"{where} does not fit its own header: {error}") from error
     return Model(name, header, layout, arrays, arrays.pop("mean_shape"), digest)
@@ -220,16 +225,33 @@ def weight_shapes(header: dict, points: int) -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def _check_arrays(header: dict, layout: Layout, arrays: dict[str, np.ndarray]) -> None:
-    metres = header["metres_per_unit"]
-    if metres is not None and not (isinstance(metres, float) and math.isfinite(metres) and metres > 0):
-        raise ValueError(f"metres_per_unit is {metres!r}")
+def _check(header: dict, layout: Layout, arrays: dict[str, np.ndarray]) -> None:
+    """Raise ValueError, TypeError or KeyError where the header is not one or the arrays are not those it speaks of."""
+    _check_metres(header["metres_per_unit"])
+    _check_architecture(header)
     expected = weight_shapes(header, len(layout.names))
-    if set(expected) != set(arrays):
-        raise ValueError(f"arrays missing or unknown: {', '.join(sorted(set(expected) ^ set(arrays)))}")
+    if odd := sorted(set(expected) ^ set(arrays)):
+        raise ValueError(f"arrays missing or unknown: {', '.join(odd[:5])}{' ...' if len(odd) > 5 else ''}")
     for name, shape in expected.items():
-        if arrays[name].dtype != np.float32 or arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-            raise ValueError(f"array {name} is not finite float32 of shape {shape}")
+        # Larger weights than any training gives would overflow in the forward pass.
+        if arrays[name].dtype != np.float32 or arrays[name].shape != shape or not (np.abs(arrays[name]) < 1e6).all():
+            raise ValueError(f"array {name} is not float32 of shape {shape} and moderate size")
+
+
+def _check_metres(metres: object) -> None:
+    if metres is not None and not (type(metres) in (int, float) and 1e-6 < metres < 1e6):
+        raise ValueError(f"metres_per_unit is {metres!r}")
+
+
+def _check_architecture(header: dict) -> None:
+    encoder, decoder = header["architecture"]["encoder"], header["architecture"]["decoder"]
+    if (encoder["kind"], decoder["kind"]) != ("residual", "mlp"):
+        raise ValueError(f"unknown architecture {encoder['kind']!r}, {decoder['kind']!r}")
+    sizes = [header["bottleneck"], encoder["width"], *decoder["hidden"]]
+    if not all(type(size) is int and 0 < size <= 2**14 for size in [*sizes, encoder["blocks"]]):
+        raise ValueError("layer sizes must be positive whole numbers")
+    if len(sizes) > _MAX_LAYERS or encoder["blocks"] > _MAX_LAYERS:
+        raise ValueError(f"more than {_MAX_LAYERS} layers")
 
 
 def save_model(path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray]) -> None:
@@ -246,7 +268,7 @@ def save_model(path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarr
     header = {"format": FORMAT_VERSION, **header}
     arrays = {name: np.asarray(value, np.float32) for name, value in arrays.items()}
     try:
-        _check_arrays(header, Layout.from_dict(header["layout"]), arrays)
+        _check(header, Layout.from_dict(header["layout"]), arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(f"not saved, the model does not fit its own header: {error}") from error
     text = json.dumps(header, indent=1, sort_keys=True).encode()
@@ -256,18 +278,3 @@ def save_model(path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarr
         archive.comment = b"0" * _DIGEST_CHARS
     body = buffer.getvalue()[:-_DIGEST_CHARS]
     write_atomically(path, body + hashlib.sha256(body).hexdigest().encode())
-
-
-def write_atomically(path: str | os.PathLike, data: bytes) -> None:
-    """Write a file that is there whole or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise

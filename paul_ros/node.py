@@ -18,6 +18,7 @@ import array
 import functools
 import importlib
 import json
+import re
 import signal
 import sys
 import threading
@@ -176,6 +177,8 @@ class LifterNode(Node):
     def _on_camera_info(self, msg: CameraInfo) -> None:
         self.stream.camera_info(msg)
         self._report_drops()
+        if self.stream.notes["distorted_image"] and "distorted_image" not in self._warned:
+            self._warn("distorted_image", self.stream.explanations["distorted_image"])
         self._publish_layout()
 
     def _on_keypoints(self, msg, info: dict) -> None:
@@ -198,10 +201,14 @@ class LifterNode(Node):
             self.stream.explanations["missed"] = "Lost on the way, or newer came before they could be lifted"
 
     def _publish(self, frame) -> None:
-        """Builds and publishes what somebody listens to."""
-        for name, publisher in self._outputs.items():
-            if publisher.get_subscription_count():
-                publisher.publish(frame.message(name, self._make))
+        """Builds what somebody listens to and then publishes it, so that a fault leaves no half frame."""
+        built = [
+            (publisher, frame.message(name, self._make))
+            for name, publisher in self._outputs.items()
+            if publisher.get_subscription_count()
+        ]
+        for publisher, message in built:
+            publisher.publish(message)
 
     def _publish_layout(self) -> None:
         """Says what the outputs mean, again whenever that changes."""
@@ -320,19 +327,36 @@ def _parse(argv: list[str]) -> None:
     parser.parse_args(remove_ros_args(argv)[1:])
 
 
+def _join_ros(argv: list[str]) -> None:
+    """Reads the arguments and starts rclpy; raises ValueError where ROS does not take them."""
+    try:
+        _parse(argv)
+        # rclpy's own handlers would shut the context down in the midst of a frame, which could not be published.
+        rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise ValueError(
+            f"ROS does not start: {error}; arguments are --ros-args -p NAME:=VALUE, -r FROM:=TO, "
+            "--params-file FILE, see --help"
+        ) from error
+
+
+def _one_line(error: Exception) -> str:
+    """The error's text without line breaks and the places in rcl's own source that it names."""
+    return re.sub(r",? at \S+\.c(pp)?:\d+", "", " ".join(str(error).split()))
+
+
 def main() -> int:
     """Runs the node until SIGINT or SIGTERM; 0 after a clean end, 1 where it cannot start."""
-    _parse(sys.argv)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    # rclpy's own handlers would shut the context down in the midst of a frame, which could not be published.
-    rclpy.init(args=sys.argv, signal_handler_options=SignalHandlerOptions.NO)
     try:
+        _join_ros(sys.argv)
         node = LifterNode()
-    except (ModelError, LayoutError, ParameterException, ValueError) as error:
-        print(f"lifter: {error}", file=sys.stderr)
-        rclpy.shutdown()
+    # rclpy has no common class for its errors, but most are RuntimeErrors.
+    except (ModelError, LayoutError, ParameterException, ValueError, RuntimeError) as error:
+        print(f"lifter: {_one_line(error)}", file=sys.stderr)
+        rclpy.try_shutdown()
         return 1
     node.get_logger().info(f"ready {_process_seconds():.2f} s after the process started")
     _spin(node, stop)

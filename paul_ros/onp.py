@@ -101,19 +101,17 @@ def onp(
     # itself is then the competitor whose residual tells how clear the decision was.
     merged = _dot(n, mirror) > 1 - 1e-6
     mirror = np.where(merged[:, None], _necker(problem, n), mirror)
-    R, s, residual = _pose(problem, n, scale)
-    R_mirror, s_mirror, residual_mirror = _pose(problem, mirror, scale)
-    translation = problem.W_mean - s[:, None] * np.einsum("nij,nj->ni", R[:, :2], problem.S_mean)
+    R, s, residual = (np.split(part, 2) for part in _pose(problem.twice(), np.concatenate([n, mirror]), scale))
     return OnP(
-        R,
-        s,
-        translation,
-        residual,
-        certified & problem.determined,
-        problem.determined,
-        R_mirror,
-        s_mirror,
-        np.maximum(residual_mirror, residual),
+        R=R[0],
+        scale=s[0],
+        translation=problem.W_mean - s[0][:, None] * _times(R[0][:, :2], problem.S_mean),
+        residual=residual[0],
+        certified=certified & problem.determined,
+        determined=problem.determined,
+        R_mirror=R[1],
+        scale_mirror=s[1],
+        residual_mirror=np.maximum(residual[1], residual[0]),
     )
 
 
@@ -133,6 +131,7 @@ class _Problem:
     D: np.ndarray
     trace_A: np.ndarray
     trace_D: np.ndarray
+    thin: np.ndarray  # (N,3) the axis along which the shape is thinnest
     determined: np.ndarray
 
     @classmethod
@@ -156,9 +155,9 @@ class _Problem:
         A, B = Sw @ S.transpose(0, 2, 1), W @ Sw.transpose(0, 2, 1)
         # The second eigenvalue of A vanishes when all points lie on one line: rotation about that line is then free.
         # And an image whose points differ by rounding alone says nothing.
-        spread = np.linalg.eigvalsh(A)[:, 1]
+        spread, axes = np.linalg.eigh(A)
         seen = np.abs(W).max((1, 2), initial=0.0) * size > 1e-12 * largest
-        determined = (used.sum(1) >= MIN_POINTS) & (spread > 1e-10) & seen
+        determined = (used.sum(1) >= MIN_POINTS) & (spread[:, 1] > 1e-10) & seen
         D = B.transpose(0, 2, 1) @ B
         return cls(
             S,
@@ -173,6 +172,7 @@ class _Problem:
             D,
             np.trace(A, axis1=1, axis2=2),
             np.trace(D, axis1=1, axis2=2),
+            axes[:, :, 0],
             determined,
         )
 
@@ -246,8 +246,7 @@ def _facing(p: _Problem, n: np.ndarray) -> np.ndarray:
 
 def _necker(p: _Problem, n: np.ndarray) -> np.ndarray:
     """The Necker reversal of n: reflected about the axis along which the shape is thinnest."""
-    e = np.linalg.eigh(p.A)[1][:, :, 0]
-    return _facing(p, 2 * _dot(e, n)[:, None] * e - n)
+    return _facing(p, 2 * _dot(p.thin, n)[:, None] * p.thin - n)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -278,8 +277,8 @@ def _ascend(goal: Goal, p: _Problem, n: np.ndarray) -> np.ndarray:
     for _ in range(_NEWTON_STEPS):
         step = _newton_step(n, now[1], now[2])
         n, now, moved = _backtrack(goal, p, n, step, now)
-        # Newton's error squares at every step: after one of 1e-5 it is 1e-10.
-        if not np.any(moved & (np.abs(step).max(1) > 1e-5)):
+        # Newton's error squares at every step: after one of 1e-7 nothing is left to gain.
+        if not np.any(moved & (np.abs(step).max(1) > 1e-7)):
             break
     return n
 
@@ -333,10 +332,11 @@ def _certify(goal: Goal, p: _Problem, n: np.ndarray) -> np.ndarray:
         K, k = p.A - p.D / tau[..., None], p.c / tau
     else:  # T <= g* (tr A - n^T A n) everywhere if and only if g* is the maximum (Dinkelbach 1967)
         K, k = goal(p, n)[0][:, None, None] * p.A - p.D, p.c
-    multiplier = _dot(n, _times(K, n) + k)
-    top = np.linalg.eigvalsh(K)[:, -1]
-    slack = 1e-9 * (np.abs(K).max((1, 2)) + np.abs(k).max(1))
-    return top <= multiplier + slack
+    pull = _times(K, n) + k
+    multiplier = _dot(n, pull)
+    size = np.abs(K).max((1, 2)) + np.abs(k).max(1)
+    stationary = np.abs(pull - multiplier[:, None] * n).max(1) <= 1e-6 * size
+    return stationary & (np.linalg.eigvalsh(K)[:, -1] <= multiplier + 1e-9 * size)
 
 
 def _search(goal: Goal, p: _Problem, n: np.ndarray) -> np.ndarray:

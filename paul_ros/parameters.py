@@ -35,6 +35,9 @@ PARAMETERS = (
     ),
 )
 
+#: Name -> default.
+DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
+
 
 def as_yaml() -> str:
     """config/lifter.yaml: every parameter with its default and its description."""

@@ -15,13 +15,16 @@ import numpy as np
 
 from msg_adapters.keypoints import Intrinsics
 
+_HALF_FIELD = 0.5  # cosine of 60 degrees
+
 
 @dataclass(frozen=True)
 class CentredView:
     """N persons as N virtual cameras see them, each turned to its person.
 
     Attributes:
-        W: (N,2,P) normalised image points (unit focal length) in the virtual cameras; hidden points are NaN.
+        W: (N,2,P) normalised image points (unit focal length) in the virtual cameras; NaN where hidden, or farther than
+            60 degrees from the person's direction, where no point of a person in front of a camera is.
         turn: (N,3,3) rotations from the virtual cameras to the real one.
     """
 
@@ -40,13 +43,13 @@ def centred_view(xy: np.ndarray, visible: np.ndarray, camera: Intrinsics) -> Cen
     rays = np.stack(
         [(xy[..., 0] - camera.cx) / camera.fx, (xy[..., 1] - camera.cy) / camera.fy, np.ones(xy.shape[:2])], axis=2
     )
-    rays = np.where(visible[..., None], rays, np.nan)
+    # Unit rays, so that one wild detection cannot turn the camera away from all the others.
+    rays = np.where(visible[..., None], rays / np.linalg.norm(rays, axis=2, keepdims=True), np.nan)
     towards = np.nanmean(rays, axis=1)
     turn = _turn_from_axis(towards / np.linalg.norm(towards, axis=1, keepdims=True))
     seen = np.einsum("nji,npj->nip", turn, rays)
     with np.errstate(invalid="ignore"):
-        # Points at or beyond the virtual camera's horizon have no image in it.
-        return CentredView(np.where(seen[:, 2:] > 0.05, seen[:, :2] / seen[:, 2:], np.nan), turn)
+        return CentredView(np.where(seen[:, 2:] > _HALF_FIELD, seen[:, :2] / seen[:, 2:], np.nan), turn)
 
 
 def _turn_from_axis(direction: np.ndarray) -> np.ndarray:

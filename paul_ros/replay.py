@@ -38,9 +38,14 @@ ERRORS = (
     "root_error_median_percent",
 )
 """The error keys of a report, and of the baseline in it."""
+LEAST_POINTS = 4
+"""That the truth of a person must have: three fit nearly any shape."""
 
 CAMERA_INFO, POSE_ARRAY = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseArray"
+_OPTIONS = {"keypoints": "--topic", "camera info": "--camera-info-topic", "ground truth": "--ground-truth-topic"}
 _MM = 1000.0
+_FARTHEST = 1e9  # metres; what is farther off, or no number, is no truth
+_LEAST_SIZE = 1e-6  # metres; all points in one place are no truth either
 
 
 class WrongTopic(BagError):
@@ -75,7 +80,8 @@ class Replay:
     """A replayed bag.
 
     frames: in the bag's order. truth: stamp -> (N,P,3) metres, camera frame, in the model's layout; row i is the person
-    of row i of the keypoints of that stamp. damage: what was wrong with the bag; then only what lies before it is here.
+    of row i of the keypoints of that stamp; points that the truth lacks are NaN. damage: what was wrong with the bag;
+    then only what lies before it is here.
     """
 
     bag: Path
@@ -152,19 +158,19 @@ class _Shell:
         """True where the record was a keypoint message."""
         if self.writer:
             self.writer.write_record(record)
-        if record.topic == self.topics.camera_info:
-            self.done.stream.camera_info(_decoded(record, CAMERA_INFO, "--camera-info-topic"))
-        elif record.topic == self.topics.truth:
-            self._take_truth(_decoded(record, POSE_ARRAY, "--ground-truth-topic"))
-        else:
+        if record.topic == self.topics.keypoints:
             self._take_keypoints(record)
             return True
+        if record.topic == self.topics.camera_info:
+            self.done.stream.camera_info(_decoded(record, "camera info", CAMERA_INFO))
+        else:
+            self._take_truth(_decoded(record, "ground truth", POSE_ARRAY))
         return False
 
     def _take_keypoints(self, record: Record) -> None:
         self.keypoint_messages += 1
         stream = self.done.stream
-        frame = stream.keypoints(record.type_name, _decoded(record, tuple(msg_adapters.SUPPORTED), "--topic"))
+        frame = stream.keypoints(record.type_name, _decoded(record, "keypoints", *msg_adapters.SUPPORTED))
         self._write_layout(record.log_time)
         if frame is None:
             return
@@ -176,6 +182,7 @@ class _Shell:
     def _take_truth(self, message: object) -> None:
         stream = self.done.stream
         flat = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses], float).reshape(-1, 3)
+        flat[~(np.abs(flat) < _FARTHEST).all(axis=1)] = np.nan
         points = len(stream.layout.names)
         if len(flat) % points:
             stream.drops["truth_wrong_point_count"] += 1
@@ -200,10 +207,12 @@ def map_points(mapping: Mapping, points: np.ndarray) -> np.ndarray:
     return mapped
 
 
-def _decoded(record: Record, expected: str | tuple[str, ...], option: str) -> object:
-    if record.type_name not in ([expected] if isinstance(expected, str) else expected):
-        wanted = expected if isinstance(expected, str) else " or ".join(expected)
-        raise WrongTopic(f"{record.topic} is a {record.type_name}, not {wanted}: choose another with {option}")
+def _decoded(record: Record, role: str, *readable: str) -> object:
+    if record.type_name not in readable:
+        raise WrongTopic(
+            f"{record.topic} is a {record.type_name}, not readable as {role} ({' or '.join(readable)} is): "
+            f"choose another with {_OPTIONS[role]}"
+        )
     return record.message()
 
 
@@ -221,8 +230,9 @@ def _nothing_there(bag: Path, topics: Topics) -> str:
 def evaluate(done: Replay) -> dict:
     """The report of a replay: the fixed keys of `paul replay --json` and some more; None where there is no truth.
 
-    Shape errors are over all P points, hidden ones too, of every person that was lifted and has a ground truth.
-    NE and the position of the root need metric output, so they are None in model units.
+    Shape errors are over all points, hidden ones too, that the ground truth of a lifted person has: of
+    persons_with_truth persons the share points_with_truth_share of the P points. NE and the position of the root need
+    metric output, so they are None in model units.
     """
     stream = done.stream
     model = stream.lifter.model
@@ -267,32 +277,73 @@ def with_truth(done: Replay, frames: list[LiftedFrame]) -> list[tuple[Lifted, np
 
 def errors(pairs: list[tuple[Lifted, np.ndarray]], root: tuple[int, ...]) -> dict:
     """Errors of lifted persons against truth; pairs of (Lifted of N persons, truth (N,P,3) in metres)."""
-    predicted, truth = matched(pairs)
-    found: dict = dict.fromkeys(ERRORS)
-    if len(predicted):
-        found["n_mpjpe_mm"] = _number(_MM * metrics.n_mpjpe(predicted, truth).mean())
-        found["pa_mpjpe_mm"] = _number(_MM * metrics.pa_mpjpe(predicted, truth).mean())
-    if len(predicted) and all(lifted.units == "m" for lifted, _ in pairs):
-        found["ne_flip_frame_percent"] = _number(100 * metrics.normalised_error_flip_frame(predicted, truth).mean())
-        found["ne_flip_global_percent"] = _number(100 * metrics.normalised_error_flip_global(predicted, truth).mean())
-        true_root = truth[:, root].mean(1)
-        missed = np.linalg.norm(predicted[:, root].mean(1) - true_root, axis=1)
+    both = matched(pairs)
+    found: dict = {"persons_with_truth": len(both.truth), "points_with_truth_share": None, **dict.fromkeys(ERRORS)}
+    if not len(both.truth):
+        return found
+    found["points_with_truth_share"] = float(both.present.mean())
+    found["n_mpjpe_mm"] = _number(_MM * both.distances(metrics.n_mpjpe).mean())
+    found["pa_mpjpe_mm"] = _number(_MM * both.distances(metrics.pa_mpjpe).mean())
+    if all(lifted.units == "m" for lifted, _ in pairs):
+        found.update(_metric_errors(both, list(root)))
+    return found
+
+
+def _metric_errors(both: Matched, root: list[int]) -> dict:
+    """Those that need metres: NE, and the root's position of the persons whose truth has it."""
+    frame, whole = metrics.normalised_error_flip_frame, metrics.normalised_error_flip_global
+    found = {
+        "ne_flip_frame_percent": _number(100 * frame(both.predicted, both.truth).mean()),
+        "ne_flip_global_percent": _number(100 * whole(both.predicted, both.truth).mean()),
+    }
+    placed = both.present[:, root].all(axis=1)
+    if placed.any():
+        true_root = both.truth[placed][:, root].mean(1)
+        missed = np.linalg.norm(both.predicted[placed][:, root].mean(1) - true_root, axis=1)
         found["root_error_median_mm"] = _number(_MM * np.median(missed))
-        found["root_error_median_percent"] = _number(100 * np.median(missed / np.linalg.norm(true_root, axis=1)))
-    return {"persons_with_truth": len(predicted), **found}
+        with np.errstate(divide="ignore", invalid="ignore"):  # a truth without position has its root in the camera
+            share = missed / np.linalg.norm(true_root, axis=1)
+        found["root_error_median_percent"] = _number(100 * np.median(share))
+    return found
 
 
-def matched(pairs: list[tuple[Lifted, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Predictions and truths (M,P,3) of all persons that were lifted and whose truth is whole."""
-    predicted, truths = [], []
-    for lifted, truth in pairs:
-        if len(truth) == len(lifted.points):
-            both = lifted.ok & np.isfinite(truth).all(axis=(1, 2))
-            predicted.append(lifted.points[both])
-            truths.append(truth[both])
-    if not predicted:
-        return np.zeros((0, 1, 3)), np.zeros((0, 1, 3))
-    return np.concatenate(predicted), np.concatenate(truths)
+@dataclass(frozen=True)
+class Matched:
+    """M lifted persons beside their truth.
+
+    predicted, truth: (M,P,3); where the truth lacks a point, both hold the mean of their others there, so that it
+    counts for nothing: it moves no centre and has no error. present: (M,P) bool, the points that the truth has.
+    """
+
+    predicted: np.ndarray
+    truth: np.ndarray
+    present: np.ndarray
+
+    def distances(self, measure: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+        """(M,) of a measure that is a mean over points: here over those that the truth has."""
+        return measure(self.predicted, self.truth) / self.present.mean(axis=1)
+
+
+def matched(pairs: list[tuple[Lifted, np.ndarray]]) -> Matched:
+    """All persons that were lifted and whose truth has LEAST_POINTS points or more, not all in one place."""
+    pairs = [(lifted, truth) for lifted, truth in pairs if len(truth) == len(lifted.points)]
+    if not pairs:
+        return Matched(np.zeros((0, 1, 3)), np.zeros((0, 1, 3)), np.zeros((0, 1), bool))
+    truth = np.concatenate([truth for _, truth in pairs])
+    present = np.isfinite(truth).all(axis=2)
+    usable = np.concatenate([lifted.ok for lifted, _ in pairs]) & (present.sum(axis=1) >= LEAST_POINTS)
+    predicted = np.concatenate([lifted.points for lifted, _ in pairs])[usable]
+    present = present[usable]
+    predicted, truth = _filled(predicted, present), _filled(truth[usable], present)
+    sized = np.ptp(truth, axis=1).max(axis=1) > _LEAST_SIZE
+    return Matched(predicted[sized], truth[sized], present[sized])
+
+
+def _filled(points: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Points (M,P,3) with the mean of a person's present ones (M,P) in place of the others."""
+    inside = present[..., None]
+    mean = np.where(inside, points, 0.0).sum(axis=1, keepdims=True) / present.sum(axis=1)[:, None, None]
+    return np.where(inside, points, mean)
 
 
 def versions() -> dict[str, str | None]:

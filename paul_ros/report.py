@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from paul_ros import metrics
-from paul_ros.model import write_atomically
-from paul_ros.replay import LiftedFrame, Replay, matched, rigid_frames
+from paul_ros.files import write_atomically
+from paul_ros.replay import LEAST_POINTS, LiftedFrame, Replay, matched, rigid_frames
 
 _ROWS = (
     ("N-MPJPE", "n_mpjpe_mm", "mm"),
@@ -48,7 +48,7 @@ def table(report: dict) -> str:
         f"units {report['units']}",
     ]
     if report["persons_with_truth"]:
-        lines += ["", f"  {'':<22}{'lifted':>9}{'rigid':>9}"]
+        lines += ["", f"  {_judged(report)}", f"  {'':<22}{'lifted':>9}{'rigid':>9}"]
         lines += [
             f"  {name:<22}{_cell(report[key])}{_cell(report['baseline'][key])}  {unit}" for name, key, unit in _ROWS
         ]
@@ -61,6 +61,13 @@ def table(report: dict) -> str:
         f"(99 %: {_cell(report['lift_us_p99']).strip()})",
     ]
     return "\n".join(lines)
+
+
+def _judged(report: dict) -> str:
+    """Whom the errors are of; they say nothing of the others."""
+    judged, persons, share = (report[key] for key in ("persons_with_truth", "persons", "points_with_truth_share"))
+    points = "" if share == 1 else f", over {100 * share:.0f} % of their points"
+    return f"errors of {judged} of {persons} persons, {100 * (1 - judged / persons):.1f} % left out{points}"
 
 
 def _cell(value: float | None, factor: float = 1.0) -> str:
@@ -137,8 +144,9 @@ class _Row:
 def _row(name: str, bodies: list[np.ndarray], truths: list[np.ndarray]) -> _Row:
     """All panels of a row share one scale, so that they can be compared."""
     points = np.concatenate([body.reshape(-1, 2) for body in (*bodies, *truths)])
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    margin = 0.08 * (high - low).max()
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.08 * (high - low).max() or 1.0  # of bodies without size too
     return _Row(name, bodies, truths, low - margin, high + margin)
 
 
@@ -171,21 +179,22 @@ def _at_true_root(done: Replay, frame: LiftedFrame) -> tuple[np.ndarray, np.ndar
     """Lifted persons moved to where they truly stood, so that shape and pose can be compared; and their truth,
     empty where there is none.
 
-    Metric shapes keep their size; shapes in model units get the truth's.
+    Metric shapes keep their size; shapes in model units get the truth's. A person whose truth lacks a point of the root
+    is placed by all points that it has, one whose truth cannot be judged by stays.
     """
     points, truth = frame.lifted.points[frame.lifted.ok], done.truth.get(frame.stamp)
     if truth is None or len(truth) != len(frame.lifted.ok):
         return points, np.empty((0, *points.shape[1:]))
     truth, root = truth[frame.lifted.ok], list(done.stream.lifter.model.layout.root)
-    points = points - points[:, root].mean(1, keepdims=True)
-    if frame.lifted.units != "m":
-        centred = truth - truth[:, root].mean(1, keepdims=True)
-        points = (
-            points
-            * np.linalg.norm(centred, axis=(1, 2), keepdims=True)
-            / np.linalg.norm(points, axis=(1, 2), keepdims=True)
-        )
-    return points + truth[:, root].mean(1, keepdims=True), truth
+    present = np.isfinite(truth).all(axis=2)
+    for person in np.flatnonzero(present.sum(axis=1) >= LEAST_POINTS):
+        anchor = root if present[person, root].all() else present[person]
+        body, target = points[person] - points[person, anchor].mean(0), truth[person, anchor].mean(0)
+        if frame.lifted.units != "m":
+            shown = present[person]
+            body *= np.linalg.norm(truth[person, shown] - target) / np.linalg.norm(body[shown])
+        points[person] = body + target
+    return points, truth
 
 
 def _draw_bones(ax: Any, done: Replay, points: np.ndarray, truth: bool = False) -> None:
@@ -225,7 +234,7 @@ def _draw_errors(ax: Any, done: Replay, chosen: list[LiftedFrame]) -> None:
 def _draw_line(ax: Any, done: Replay, frames: list[LiftedFrame], measure: Any, colour: str, label: str) -> None:
     """Mean error over the persons of each frame; a gap where nobody was lifted."""
     pairs = [matched([(frame.lifted, done.truth[frame.stamp])]) for frame in frames]
-    means = [1000 * measure(*pair).mean() if len(pair[0]) else np.nan for pair in pairs]
+    means = [1000 * pair.distances(measure).mean() if len(pair.truth) else np.nan for pair in pairs]
     ax.plot([_seconds(done, frame) for frame in frames], means, color=colour, linewidth=1.3, label=label)
 
 

@@ -231,7 +231,7 @@ def _fitting(target: Layout) -> str:
 
 def _parse(data: object) -> Layout:
     data = _mapping(data, "a layout")
-    unknown = [str(key) for key in data if key not in _KEYS]
+    unknown = [key if isinstance(key, str) else _shown(key) for key in data if key not in _KEYS]
     if unknown:
         raise LayoutError(f"unknown key {_listed(unknown)}; the keys are {', '.join(_KEYS)}")
     missing = [key for key in ("name", "names", "root") if key not in data]
@@ -323,9 +323,16 @@ def _list(value: object, where: str) -> list:
 def _text(value: object, where: str) -> str:
     if not isinstance(value, str) or not value:
         if isinstance(value, (bool, int, float)):  # what YAML makes of an unquoted `no` or `12`
-            raise LayoutError(f"{where} must be text, but YAML reads it as {value!r}: put it in quotes")
+            raise LayoutError(f"{where} must be text, but YAML reads it as {_shown(value)}: put it in quotes")
         raise LayoutError(f"{where} must be text, not {'empty' if value == '' else type(value).__name__}")
     return value
+
+
+def _shown(value: object) -> str:
+    """A scalar for a message; Python refuses to print integers of thousands of digits."""
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"a number of {value.bit_length()} bits"
+    return repr(value)
 
 
 def _listed(names: list[str]) -> str:

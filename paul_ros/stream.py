@@ -18,13 +18,19 @@ import numpy as np
 
 import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D, MessageError, WrongPointCount, outputs
-from paul_ros.lifter import Lifted, Lifter
+from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
 from paul_ros.skeleton import Layout, layout_names, load_layout
 
 #: Lift times kept for the median and the 99th percentile: the last half minute at 30 Hz.
 _TIMES_KEPT = 1000
 #: Bones are drawn this wide, as a share of the mean shape's largest extent.
 _BONE_WIDTH = 0.01
+#: Why a person is left out.
+_LEFT_OUT = {
+    TOO_FEW_POINTS: "too few of its keypoints are visible",
+    DEGENERATE_POINTS: "its keypoints lie on one line or within about a pixel",
+    TOO_FAR: f"it would stand more than {MAX_DISTANCE:.0f} m away; if it does not, check camera_info",
+}
 
 _log = logging.getLogger(__name__)
 
@@ -112,6 +118,12 @@ class LiftStream:
         """Takes the intrinsics; of an unusable CameraInfo nothing is taken and the drop is counted."""
         with self.guard():
             self.intrinsics = msg_adapters.read_camera_info(msg)
+            if self.intrinsics.distorted:
+                self.notes["distorted_image"] += 1
+                self.explanations["distorted_image"] = (
+                    "CameraInfo has distortion but no P, so K is used: positions are a little wrong unless the "
+                    "keypoints are of an undistorted image; let the camera's driver fill P and rectify the image"
+                )
 
     def keypoints(self, type_name: str, msg) -> Frame | None:
         """Lifts one message; None = dropped, counted and explained. Zero persons are a frame too."""
@@ -174,7 +186,7 @@ class LiftStream:
         lifted = self._lift(keypoints)
         self.counts.update(frames=1, persons=keypoints.persons, lifted=int(lifted.ok.sum()))
         for reason in filter(None, lifted.reason):
-            self._drop("person_" + reason, "this person is left out of the outputs")
+            self._drop("person_" + reason, f"{_LEFT_OUT[reason]}; this person is left out of the outputs")
         model = self.lifter.model
         unit = model.metres_per_unit if lifted.units == "m" else 1.0
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
@@ -197,7 +209,12 @@ def _scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) 
         return "none: the model does not know its size in metres"
     if intrinsics is None:
         return "none: no usable CameraInfo has come"
-    return "the model's metres per unit; distance from the camera's focal length"
+    image = {"P": "the rectified image", "K": "the raw image, for P is not filled"}[intrinsics.matrix]
+    uncorrected = ", whose distortion is not corrected" if intrinsics.distorted else ""
+    return (
+        "the model's metres per unit; distance from the camera's focal length, "
+        f"CameraInfo's {intrinsics.matrix}: {image}{uncorrected}"
+    )
 
 
 @functools.cache

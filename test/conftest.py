@@ -126,7 +126,10 @@ def model_file(tmp_path_factory) -> Path:
         "bottleneck": 2,
         "metres_per_unit": metres,
         "chirality": {"known": True, "source": "made by hand"},
-        "architecture": {"encoder": {"width": 4, "blocks": 1}, "decoder": {"hidden": [4]}},
+        "architecture": {
+            "encoder": {"kind": "residual", "width": 4, "blocks": 1},
+            "decoder": {"kind": "mlp", "hidden": [4]},
+        },
     }
     arrays = {name: np.zeros(size) for name, size in weight_shapes(header, 17).items()}
     arrays["mean_shape"], arrays["decoder.1.bias"] = shape, shape.ravel()

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import array
+
 import numpy as np
 import pytest
 from conftest import camera_info, header_of
@@ -277,7 +279,14 @@ def test_pose_array_of_nobody(make):
     assert read(POSES, poses_of(make, np.empty((0, 3))), P).xy.shape == (0, P, 2)
 
 
-@pytest.mark.parametrize("z", [1.7, -0.2, np.inf])
+def test_pose_array_confidence_a_little_above_one_is_clipped(make):
+    confidence = np.array([1.05, 1.01, 1, 0.5, 0.9])[None, :, None]
+    got = read(POSES, poses_of(make, np.concatenate([some_points(1), confidence], axis=-1)), P)
+    np.testing.assert_array_equal(got.confidence, [[1, 1, 1, 0.5, 0.9]])
+    assert got.visible.all()
+
+
+@pytest.mark.parametrize("z", [1.06, 1.7, -0.2, np.inf])
 def test_pose_array_that_is_3d(make, z):
     xyz = np.concatenate([some_points(), np.zeros((2, P, 1))], axis=-1)
     xyz[1, 3, 2] = z
@@ -342,6 +351,53 @@ def test_camera_info_that_is_no_camera(make, wrong):
     assert error.value.reason == "bad_intrinsics"
 
 
+def info_with(make, p=(600, 600, 320, 240), k=(600, 600, 320, 240), d=(0.0,) * 5, size=(640, 480)):
+    """CameraInfo with fx, fy, cx, cy of P and of K."""
+    msg = camera_info(make)
+    msg.p = np.array([p[0], 0, p[2], 0, 0, p[1], p[3], 0, 0, 0, 1.0, 0])
+    msg.k = np.array([k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1.0])
+    msg.d, (msg.width, msg.height) = array.array("d", d), size
+    return msg
+
+
+def test_camera_info_is_that_of_the_rectified_image(make):
+    got = read_camera_info(info_with(make, p=(580, 581, 330, 250), k=(610, 611, 315, 235), d=(-0.3, 0.1, 0, 0, 0)))
+    assert (got.fx, got.fy, got.cx, got.cy) == (580, 581, 330, 250)
+    assert got.matrix == "P" and not got.distorted
+
+
+@pytest.mark.parametrize("p", [(0, 0, 0, 0), (580, 0, 330, 250), (np.nan, 581, 330, 250), (580, 581, np.inf, 250)])
+@pytest.mark.parametrize("d, distorted", [((), False), ((0.0,) * 5, False), ((0, 0, 0.01, 0, 0), True)])
+def test_camera_info_without_p_is_that_of_the_raw_image(make, p, d, distorted):
+    got = read_camera_info(info_with(make, p=p, k=(610, 611, 315, 235), d=d))
+    assert (got.fx, got.fy, got.cx, got.cy) == (610, 611, 315, 235)
+    assert got.matrix == "K" and got.distorted is distorted
+
+
+@pytest.mark.parametrize("unfilled", [(0, 0, 0, 0), None])
+@pytest.mark.parametrize(
+    "numbers, size",
+    [
+        ((1e300, 1e300, 320, 240), (640, 480)),
+        ((1e-300, 1e-300, 320, 240), (0, 0)),
+        ((600, 1e6, 320, 240), (640, 480)),
+        ((600, 600, 1e300, 240), (640, 480)),
+        ((1.2, 1.6, 0.5, 0.5), (1280, 720)),
+        ((1.2, 1.6, 0.5, 0.5), (0, 0)),
+        ((1e7, 1e7, 320, 240), (0, 0)),
+    ],
+)
+def test_camera_info_out_of_all_proportion(make, numbers, size, unfilled):
+    with pytest.raises(MessageError, match="calibrate") as error:
+        read_camera_info(info_with(make, p=unfilled or numbers, k=numbers, size=size))
+    assert error.value.reason == "bad_intrinsics"
+
+
+@pytest.mark.parametrize("focal, size", [(64.1, (640, 480)), (63_000, (480, 640)), (100, (0, 0)), (9e5, (0, 0))])
+def test_camera_info_of_wide_and_long_lenses(make, focal, size):
+    assert read_camera_info(info_with(make, p=(focal, focal, 300, 200), size=size)).fx == focal
+
+
 # --- writers
 
 
@@ -377,28 +433,47 @@ def test_points_cloud_writer(make, bag_make):
     assert msg.is_dense
 
 
+@pytest.mark.parametrize(
+    "text, number",
+    [
+        ("", -1),
+        ("0", 0),
+        ("000000000012", 12),
+        ("16777216", 16777216),
+        ("16777217", 5),
+        ("-3", 5),
+        ("9" * 5000, 5),
+        ("0" * 5000 + "7", 7),
+        ("\u0660" * 5000, 5),
+    ],
+    ids=lambda value: str(value)[:20].encode("ascii", "replace").decode(),
+)
+def test_person_ids_as_numbers(text, number):
+    assert outputs.id_numbers([""] * 5 + [text])[5] == number
+
+
 def test_markers_are_two_packed_lists_with_sides_and_hidden_points(make, bag_make):
-    points = np.random.default_rng(3).normal(size=(2, 3, 3))
-    observed = np.array([[True, True, True], [True, False, True]])
+    points = np.random.default_rng(3).normal(size=(2, 4, 3))
+    observed = np.array([[True, True, True, True], [True, False, True, True]])
+    sides = ("right", "left", "left", "right")
     msg = written(
         make,
         bag_make,
-        outputs.skeleton_markers(
-            make, header_of(make), points, observed, [(0, 1), (0, 2)], ("", "left", "right"), 0.02
-        ),
+        outputs.skeleton_markers(make, header_of(make), points, observed, [(1, 2), (0, 3), (2, 3)], sides, 0.02),
     )
     bones, spheres = msg.markers
     assert (bones.type, spheres.type) == (bones.LINE_LIST, bones.SPHERE_LIST)
     assert (bones.ns, bones.id) != (spheres.ns, spheres.id)
     assert bones.action == spheres.action == bones.ADD
-    ends = np.array([(p.x, p.y, p.z) for p in bones.points]).reshape(2, 2, 2, 3)
-    np.testing.assert_array_equal(ends, points[:, [[0, 1], [0, 2]]])
+    ends = np.array([(p.x, p.y, p.z) for p in bones.points]).reshape(2, 3, 2, 3)
+    np.testing.assert_array_equal(ends, points[:, [[1, 2], [0, 3], [2, 3]]])
     np.testing.assert_array_equal([(p.x, p.y, p.z) for p in spheres.points], points.reshape(-1, 3))
-    assert [c.a < 1 for c in spheres.colors] == [False, False, False, False, True, False]
-    assert [c.a < 1 for c in bones.colors] == [False] * 4 + [True] * 2 + [False] * 2
-    left, right = spheres.colors[1], spheres.colors[2]
-    assert left.r > left.g and right.g > right.r
-    assert bones.colors[1].r > bones.colors[1].g and bones.colors[3].g > bones.colors[3].r
+    assert [c.a < 1 for c in spheres.colors] == [False] * 5 + [True] + [False] * 2
+    assert [c.a < 1 for c in bones.colors] == [False] * 6 + [True] * 2 + [False] * 4
+    for left, right in ((spheres.colors[1], spheres.colors[0]), (bones.colors[1], bones.colors[3])):
+        assert left.r > max(left.g, left.b) and right.g > max(right.r, right.b)
+    across = bones.colors[4:6]  # from the left to the right: the colour of neither
+    assert all(colour.b > max(colour.r, colour.g) for colour in across)
     assert bones.pose.orientation.w == 1 and 0 < bones.scale.x < spheres.scale.x
 
 

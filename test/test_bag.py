@@ -208,7 +208,7 @@ def test_bytes_that_do_not_fit_their_definition(tmp_path):
         list(read_messages(tmp_path / "x.mcap"))
 
 
-def test_failure_leaves_the_old_file_and_a_readable_part(tmp_path):
+def test_failure_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(b"precious")
     make = BagMessages()
@@ -217,14 +217,22 @@ def test_failure_leaves_the_old_file_and_a_readable_part(tmp_path):
             bag.write("/poses", poses(make, 0), 0)
             raise RuntimeError
     assert path.read_bytes() == b"precious"
-    assert len(list(read_messages(tmp_path / "a.mcap.part"))) == 1
+    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_failure_before_the_first_message_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError):
-        with BagWriter(tmp_path / "a.mcap"):
-            raise RuntimeError
+def test_a_full_disk_leaves_nothing(tmp_path):
+    (tmp_path / "a.mcap.part").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left"):
+        write(tmp_path / "a.mcap")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("path, clue", [("", "it is a folder"), ("file/a.mcap", "cannot write .*file/a.mcap: ")])
+def test_where_nothing_can_be_written(tmp_path, path, clue):
+    (tmp_path / "file").touch()
+    with pytest.raises(BagError, match=clue):
+        write(tmp_path / path)
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
 
 
 def test_killed_recorder_leaves_all_but_the_last_chunk(tmp_path):

@@ -58,6 +58,55 @@ def test_the_bag_that_is_read_is_never_overwritten(tmp_path, capsys, option, nam
     assert (bag / name).read_bytes() == b"recorded"
 
 
+@pytest.mark.parametrize("option", ["-o", "--json", "--plot"])
+@pytest.mark.parametrize("output, clue", [("", "it is a folder"), ("file/x", "cannot write")])
+def test_an_output_that_cannot_be_written_is_told_first(tmp_path, capsys, monkeypatch, option, output, clue):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("paul_ros.replay.replay", lambda *_: pytest.fail("lifted in vain"))
+    assert cli.main(["replay", str(ONE), option, str(tmp_path / output)]) == 1
+    printed = capsys.readouterr()
+    assert clue in printed.err and printed.err.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
+def paul_to_nobody(*arguments, unbuffered=""):
+    """As in `paul ... | head -0`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "wb") as stdout:
+        return subprocess.run(
+            [sys.executable, "-m", "paul_ros.cli", *map(str, arguments)],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+            stdout=stdout,
+            stderr=subprocess.PIPE,
+        )
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_files_are_written_where_nobody_reads_stdout(model_file, tmp_path, unbuffered):
+    """Quietly; 141 is what a shell gives for a process that SIGPIPE ended."""
+    files = tmp_path / "out.mcap", tmp_path / "p.png", tmp_path / "r.json"
+    options = "-o", files[0], "--plot", files[1], "--json", files[2]
+    done = paul_to_nobody("replay", ONE, "--model", model_file, *options, unbuffered=unbuffered)
+    assert (done.returncode, done.stderr) == (141, b"")
+    assert sorted(tmp_path.iterdir()) == list(files)
+    done = paul_to_nobody("inspect", "coco17", "--json", tmp_path / "s.json", unbuffered=unbuffered)
+    assert (done.returncode, done.stderr) == (141, b"") and (tmp_path / "s.json").exists()
+
+
+def test_help_that_nobody_reads():
+    done = paul_to_nobody("replay", "--help")
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_no_stdout_at_all(tmp_path):
+    """As in `paul inspect coco17 >&-`."""
+    command = f"'{sys.executable}' -m paul_ros.cli inspect coco17 --json '{tmp_path / 'r.json'}' >&-"
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"") and (tmp_path / "r.json").exists()
+
+
 @pytest.mark.parametrize("arguments", [[], ["dance"], ["replay"], ["replay", "a", "--speed", "2"]])
 def test_wrong_usage(arguments, capsys):
     with pytest.raises(SystemExit) as end:
@@ -93,6 +142,7 @@ def test_half_a_bag(model_file, tmp_path):
         (["replay", ONE, "--model", "nobody"], "no model 'nobody'"),
         (["replay", ONE, "--layout", "coco71"], "did you mean 'coco17'?"),
         (["replay", ONE, "--topic", "/skeletons"], "no messages on /skeletons; the bag holds /camera_info"),
+        (["replay", ONE, "--topic", "/camera_info"], "/camera_info is a sensor_msgs/msg/CameraInfo, not readable"),
         (["replay", ONE, "-o", "/proc/nothing/out.mcap"], "cannot write"),
         (["inspect", "nobody"], "no model 'nobody'"),
         (["inspect", "nowhere.mcap"], "no such bag"),

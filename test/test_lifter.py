@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.keypoints import Intrinsics
-from paul_ros.lifter import DEGENERATE_POINTS, TOO_FEW_POINTS, Lifter
+from paul_ros.lifter import DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS, Lifter
 from paul_ros.model import load_model
 from paul_ros.placement import centred_view
 
@@ -113,6 +113,47 @@ def test_all_points_at_one_pixel_are_refused(model):
     assert lifted.reason == (DEGENERATE_POINTS,)
 
 
+def test_persons_within_about_a_pixel_are_refused_and_the_others_are_not(model):
+    """They would be lifted with a certificate, tens of kilometres away."""
+    truth = np.concatenate([standing(model, [0, 0, 5])] * 3)
+    xy = pinhole(truth)
+    centre = xy.mean(1, keepdims=True)
+    extent = np.sqrt(((xy - centre) ** 2).sum(2).mean(1))[:, None, None]
+    xy = centre + (xy - centre) / extent * np.array([0.001, 0.9, 30])[:, None, None]
+    lifted = Lifter(model).lift(xy, everything(truth), CAMERA)
+    assert lifted.reason == (DEGENERATE_POINTS, DEGENERATE_POINTS, "")
+    np.testing.assert_array_equal(np.isfinite(lifted.points).all((1, 2)), [False, False, True])
+    assert not lifted.certified[:2].any()
+
+
+def test_hidden_points_do_not_add_to_a_persons_extent(model):
+    xy = np.random.default_rng(0).normal(300, 0.3, (1, 17, 2))
+    xy[0, :5] = 900
+    visible = np.arange(17)[None] >= 5
+    assert Lifter(model).lift(xy, visible, CAMERA).reason == (DEGENERATE_POINTS,)
+
+
+@pytest.mark.parametrize("distance, reason", [(180, ""), (220, TOO_FAR)])
+def test_persons_are_lifted_up_to_a_stated_distance(rigid_lifter, model, distance, reason):
+    truth = standing(model, [0, 0, distance])
+    lifted = rigid_lifter.lift(pinhole(truth), everything(truth), CAMERA)
+    assert lifted.reason == (reason,) and np.isfinite(lifted.points).all() == (reason == "")
+
+
+def test_without_intrinsics_there_is_no_distance_to_exceed(rigid_lifter, model):
+    truth = standing(model, [0, 0, 500.0])
+    assert rigid_lifter.lift(pinhole(truth), everything(truth)).ok.all()
+
+
+@pytest.mark.parametrize("focal", [1e-300, 1e300])
+def test_no_camera_makes_it_answer_what_float32_cannot_hold(model, focal):
+    truth = standing(model, [0, 0, 5])
+    camera = Intrinsics(focal, focal, 640.0, 360.0, 0, 0)
+    with np.errstate(all="ignore"):
+        lifted = Lifter(model).lift(pinhole(truth), everything(truth), camera)
+    assert not lifted.ok.any() and np.isnan(lifted.points).all()
+
+
 def test_nan_marked_visible_counts_as_hidden(model):
     truth = standing(model, [0, 0, 5])
     xy = pinhole(truth)
@@ -144,3 +185,11 @@ def test_the_virtual_camera_looks_at_the_person():
     np.testing.assert_allclose(np.linalg.det(view.turn), 1)
     seen = np.einsum("nji,npj->nip", view.turn, truth)
     np.testing.assert_allclose(view.W, seen[:, :2] / seen[:, 2:], atol=1e-9)
+
+
+def test_one_wild_detection_does_not_turn_the_virtual_camera_away(model):
+    truth = standing(model, [0.5, 0, 5])
+    xy = pinhole(truth)
+    xy[0, 0] = [9e5, -9e5]
+    lifted = Lifter(model.rigid()).lift(xy, everything(truth), CAMERA)
+    assert lifted.ok.all() and np.linalg.norm(lifted.root - truth[:, [11, 12]].mean(1)) < 0.1

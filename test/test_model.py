@@ -99,11 +99,43 @@ def test_another_format_version_is_refused(tmp_path):
         load_model(tmp_path / "old.npz")
 
 
-@pytest.mark.parametrize("metres", [0.0, -1.0, float("nan"), "0.3"])
+@pytest.mark.parametrize("metres", [1e300, True, 0.0, -1.0, float("nan"), "0.3"])
 def test_absurd_metres_are_not_saved(tmp_path, metres):
     with pytest.raises(ModelError, match="metres_per_unit"):
         save_model(tmp_path / "bad.npz", header(metres_per_unit=metres), arrays())
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "part,change",
+    [
+        ("encoder", {"kind": "transformer"}),
+        ("encoder", {"blocks": 300_000}),
+        ("encoder", {"width": -1}),
+        ("encoder", {"width": 8.0}),
+        ("decoder", {"hidden": [1] * 5000}),
+        ("decoder", {"hidden": ["a"]}),
+    ],
+)
+def test_absurd_architectures_are_refused_in_one_short_line(tmp_path, part, change):
+    base = header()
+    base["architecture"][part].update(change)
+    with pytest.raises(ModelError) as caught:
+        save_model(tmp_path / "bad.npz", base, arrays())
+    assert len(str(caught.value)) < 200
+
+
+def test_other_npz_files_are_told_from_damaged_models(tmp_path):
+    np.savez(tmp_path / "data.npz", W=np.zeros((2, 2, 17)))
+    with pytest.raises(ModelError, match="no model file"):
+        load_model(tmp_path / "data.npz")
+
+
+def test_weights_that_would_overflow_are_refused(tmp_path):
+    huge = arrays()
+    huge["encoder.input.weight"][:] = 1e38
+    with pytest.raises(ModelError, match="encoder.input.weight"):
+        save_model(tmp_path / "bad.npz", header(), huge)
 
 
 def test_weights_that_are_not_finite_are_not_saved(tmp_path):

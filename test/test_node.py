@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import array
 import json
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from conftest import ROOT, LifterProcess, RosMake, camera_info, header_of, perso
 
 from msg_adapters import outputs
 from paul_ros import parameters
+from paul_ros.stream import OUTPUTS
 
 MAKE = RosMake()
 GOOD = persons_at((0.3, 0, 4))
@@ -352,6 +354,12 @@ def test_camera_info_turns_model_units_into_metres(ros, start_lifter, model_file
     points = bench.lifts()
     assert np.linalg.norm(points - GOOD, axis=-1).max() < 0.15
     assert bench.diagnosed()["units"] == "m"
+    distorted = camera_info(MAKE)
+    distorted.d = array.array("d", [-0.3, 0.1, 0, 0, 0])
+    for _ in range(2):
+        bench.camera.publish(distorted)
+    bench.until(lambda: int(bench.diagnosed().get("noted_distorted_image", 0)) == 2, "the note")
+    assert bench.units() == "m" and bench.lifter.log().count("rectify the image") == 1
     bench.close()
     assert "ready" in bench.lifter.log()
 
@@ -432,6 +440,86 @@ def test_a_model_file_with_one_byte_changed_is_refused(start_lifter, model_file,
 )
 def test_parameters_that_cannot_be_used_are_refused(start_lifter, model_file, argument, word):
     assert word in refused(start_lifter("-p", f"model:={model_file}", "-p", argument))
+
+
+@pytest.mark.parametrize(
+    "arguments, word",
+    [
+        (["-p", "foo"], "NAME:=VALUE"),
+        (["-r"], "FROM:=TO"),
+        (["--params-file", "/no/such.yaml"], "/no/such.yaml"),
+        (["-x"], "-x"),
+        (["-p", f"model:={'a' * 300}"], "too long"),
+        # Readable by its permissions, but reading it fails.
+        (["-p", "model:=/proc/self/mem"], "/proc/self/mem"),
+    ],
+)
+def test_arguments_that_cannot_be_used_are_refused(start_lifter, arguments, word):
+    line = refused(start_lifter(*arguments))
+    assert line.startswith("lifter: ") and word in line
+
+
+@pytest.fixture
+def lifter_node(ros, monkeypatch):
+    """The node's object in this process, with the shipped model."""
+    # Importing the node limits the threads of its process; that is undone, for the tests after this.
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.setenv(variable, "1")
+    from paul_ros.node import LifterNode
+
+    node = LifterNode()
+    yield node
+    node.destroy_node()
+
+
+class FrameThatCounts:
+    """Stands in for a lifted frame: keeps the names of the messages it was asked for; one of them may fail."""
+
+    def __init__(self, faulty: str = "") -> None:
+        self.built, self.faulty = [], faulty
+
+    def message(self, name, make):
+        self.built.append(name)
+        if name == self.faulty:
+            raise ZeroDivisionError("on purpose")
+        return make(OUTPUTS[name])
+
+
+def test_outputs_nobody_listens_to_are_not_built(ros, lifter_node):
+    def built():
+        frame = FrameThatCounts()
+        lifter_node._publish(frame)
+        return frame.built
+
+    assert built() == []
+    listener = ros.create_node("listener")
+    listener.create_subscription(class_of(OUTPUTS["poses"]), "/lifter/poses", lambda msg: None, 10)
+    end = time.monotonic() + PATIENCE
+    while not built() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert built() == ["poses"]
+    listener.destroy_node()
+
+
+def test_a_fault_in_building_leaves_no_half_frame(ros, lifter_node):
+    got = []
+    listener = ros.create_node("listener")
+    for name, type_name in OUTPUTS.items():
+        listener.create_subscription(class_of(type_name), f"/lifter/{name}", got.append, 10)
+    end = time.monotonic() + PATIENCE
+    while not all(output.get_subscription_count() for output in lifter_node._outputs.values()):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    with pytest.raises(ZeroDivisionError):
+        lifter_node._publish(FrameThatCounts(faulty="markers"))
+    lifter_node._publish(FrameThatCounts())
+    while len(got) < 3 and time.monotonic() < end:
+        ros.spin_once(listener, timeout_sec=0.02)
+    # What was published first comes first on each topic: had the faulty frame gone out in part, a fourth would come.
+    for _ in range(10):
+        ros.spin_once(listener, timeout_sec=0.02)
+    assert len(got) == 3
+    listener.destroy_node()
 
 
 def test_parameter_file_and_table_come_from_one_place():

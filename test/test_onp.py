@@ -135,3 +135,15 @@ def test_wrong_shapes_are_refused():
         onp(np.zeros((2, 3, 5)), np.zeros((2, 2, 4)))
     with pytest.raises(ValueError, match="weights"):
         onp(np.zeros((2, 3, 5)), np.zeros((2, 2, 5)), np.ones((2, 4)))
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("points", [3, 4, 8])
+def test_what_is_certified_is_never_beaten(scale, points):
+    """By climbs from other starts: a certificate must imply both a stationary pose and a global one."""
+    S, W, _ = random_problems(1500, points, 0.5, seed=points, flat=0.5)
+    found = onp(S, W, scale=scale)
+    for seed in range(4):
+        other = onp(S, W, scale=scale, start=Rotation.random(len(S), random_state=seed).as_matrix())
+        # Costs are exact to 1e-16, so residuals, their roots, to 1e-8.
+        assert (found.residual <= other.residual + 1e-7)[found.certified].all()

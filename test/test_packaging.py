@@ -189,7 +189,11 @@ def test_package_xml_is_valid_and_says_what_the_code_needs() -> None:
     required = re.findall(r"^[\w-]+", setup["options"]["install_requires"], re.MULTILINE)
     assert {f"python3-{name.lower().removeprefix('py')}" for name in required} <= needed
     node = (ROOT / "paul_ros/node.py").read_text(encoding="utf-8")
-    assert set(re.findall(r"^from (\w+_msgs)\.msg", node, re.MULTILINE)) - {"rcl_interfaces"} <= needed
+    writers = (ROOT / "msg_adapters/outputs.py").read_text(encoding="utf-8")
+    imported = set(re.findall(r"^from (\w+)\.msg import", node, re.MULTILINE))
+    made = set(re.findall(r'"(\w+)/msg/', writers))
+    assert "rcl_interfaces" in imported and "builtin_interfaces" in made
+    assert imported | made <= needed
 
 
 def test_the_environment_runs_this_source() -> None:

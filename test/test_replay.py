@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from paul_ros import metrics
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
 from paul_ros.replay import Topics, evaluate, map_points, open_stream, replay
 from paul_ros.report import PictureError, table, write_json, write_picture
 from paul_ros.skeleton import load_layout
 
-BAGS = Path(__file__).resolve().parent.parent / "bags"
+ROOT = Path(__file__).resolve().parent.parent
+BAGS = ROOT / "bags"
 ONE, TWO = BAGS / "one_person.mcap", BAGS / "two_persons_crossing.mcap"
 # Written out, not imported: what reads these reports relies on the names.
 ERRORS = {
@@ -128,6 +130,96 @@ def test_scaled_prediction_shows_in_ne_but_not_in_n_mpjpe(short, model_file):
     assert report["ne_flip_frame_percent"] == pytest.approx(25)
 
 
+@pytest.mark.parametrize("bag, most_mm", [(ONE, 62), (TWO, 50)], ids=["one", "two"])
+def test_the_shipped_model_keeps_its_word(bag, most_mm):
+    """The main figures: shape at least halves the error of a rigid model, and left is never taken for right."""
+    report = evaluate(replay(bag, open_stream()))
+    assert report["persons_with_truth"] == report["lifted"] > 0.9 * report["persons"]
+    assert report["pa_mpjpe_mm"] <= min(most_mm, 0.5 * report["baseline"]["pa_mpjpe_mm"])
+    assert report["ne_flip_global_percent"] <= 1.1 * report["ne_flip_frame_percent"]
+
+
+def test_the_shipped_models_are_small():
+    files = list((ROOT / "paul_ros" / "models").glob("*.npz"))
+    assert files and all(file.stat().st_size <= 4_000_000 for file in files)
+
+
+@pytest.fixture
+def partial(short, model_file):
+    """A replay whose truth lacks points, others in every second frame; and which points (P,) each frame has."""
+    done = replay(short, open_stream(model_file))
+    has = {}
+    for number, frame in enumerate(done.frames):
+        has[frame.stamp] = np.ones(17, bool)
+        has[frame.stamp][[3, 4] if number % 2 else [5, 7, 9]] = False
+        done.truth[frame.stamp][:, ~has[frame.stamp]] = np.nan
+    return done, has
+
+
+def test_truth_of_some_points(partial):
+    """As the measures give it of those points alone."""
+    done, has = partial
+    report = evaluate(done)
+    parts = {"n_mpjpe": [], "pa_mpjpe": [], "normalised_error": [], "mirrored": []}
+    for frame in done.frames:
+        points = frame.lifted.points[frame.lifted.ok][:, has[frame.stamp]]
+        truth = done.truth[frame.stamp][frame.lifted.ok][:, has[frame.stamp]]
+        for name in list(parts)[:3]:
+            parts[name] += getattr(metrics, name)(points, truth).tolist()
+        parts["mirrored"] += metrics.normalised_error(metrics.flip_depth(points), truth).tolist()
+    mean = {name: np.mean(values) for name, values in parts.items()}
+    assert report["persons_with_truth"] == report["lifted"] == len(parts["n_mpjpe"])
+    assert report["points_with_truth_share"] == pytest.approx(
+        np.average([has[f.stamp].mean() for f in done.frames], weights=[f.lifted.ok.sum() for f in done.frames])
+    )
+    assert report["n_mpjpe_mm"] == pytest.approx(1000 * mean["n_mpjpe"])
+    assert report["pa_mpjpe_mm"] == pytest.approx(1000 * mean["pa_mpjpe"])
+    each = np.minimum(parts["normalised_error"], parts["mirrored"]).mean()
+    assert report["ne_flip_frame_percent"] == pytest.approx(100 * each)
+    assert report["ne_flip_global_percent"] == pytest.approx(100 * min(mean["normalised_error"], mean["mirrored"]))
+    assert report["root_error_median_mm"] == pytest.approx(
+        1000 * np.median(np.concatenate([root_errors(done, frame) for frame in done.frames]))
+    )
+
+
+def root_errors(done, frame):
+    ok = frame.lifted.ok
+    hips = frame.lifted.points[ok][:, 11:13].mean(1), done.truth[frame.stamp][ok][:, 11:13].mean(1)
+    return np.linalg.norm(hips[0] - hips[1], axis=1)
+
+
+def test_table_says_whom_the_errors_are_of(short, model_file, partial):
+    whole, some = (table(evaluate(done)) for done in (replay(short, open_stream(model_file)), partial[0]))
+    report = evaluate(partial[0])
+    left_out = 100 * (1 - report["lifted"] / report["persons"])
+    assert left_out > 0
+    line = f"errors of {report['lifted']} of {report['persons']} persons, {left_out:.1f} % left out"
+    assert f"{line}\n" in whole
+    assert f"{line}, over {100 * report['points_with_truth_share']:.0f} % of their points\n" in some
+
+
+def test_truth_without_a_point_of_the_root(short, model_file):
+    done = replay(short, open_stream(model_file))
+    for truth in done.truth.values():
+        truth[:, 11] = np.nan
+    report = evaluate(done)
+    assert report["n_mpjpe_mm"] > 0 and report["ne_flip_frame_percent"] > 0
+    assert report["root_error_median_mm"] is None and report["root_error_median_percent"] is None
+
+
+@pytest.mark.parametrize(
+    "value, points", [(0.0, 17), (2.5, 17), (np.nan, 17), (np.nan, 14)], ids=["zero", "one place", "none", "three"]
+)
+def test_what_is_no_truth(short, model_file, value, points):
+    """Points in one place fit any shape scaled to nothing, and three points nearly any."""
+    done = replay(short, open_stream(model_file))
+    for truth in done.truth.values():
+        truth[:, :points] = value
+    report = evaluate(done)
+    assert report["persons_with_truth"] == 0 and all(report[key] is None for key in ERRORS)
+    assert report["points_with_truth_share"] is None and "MPJPE" not in table(report)
+
+
 def test_truth_that_comes_before_its_keypoints(short, model_file, tmp_path):
     """Joined by stamp, not by arrival."""
     records = list(read_records(short))
@@ -187,25 +279,37 @@ def test_half_a_bag_keeps_what_was_read(model_file, tmp_path):
         (without("/keypoints"), "no messages on /keypoints; the bag holds /camera_info"),
         (lambda record: None, "none at all"),
     ],
+    ids=["other topics", "empty"],
 )
 def test_nothing_to_lift(short, model_file, tmp_path, change, clue):
     bag = part_of(short, tmp_path / "x.mcap", 9, change)
     with pytest.raises(BagError, match=clue):
         replay(bag, open_stream(model_file), tmp_path / "out.mcap")
-    assert not (tmp_path / "out.mcap").exists()
+    assert [file.name for file in tmp_path.iterdir()] == ["x.mcap"]
 
 
 @pytest.mark.parametrize(
     "topics, clue",
     [
-        (Topics(keypoints="/camera_info", camera_info="/x"), "--topic"),
+        (Topics(keypoints="/camera_info", camera_info="/x"), "not readable as keypoints.*--topic"),
+        (Topics(keypoints="/camera_info"), "sensor_msgs/msg/CameraInfo, not readable as keypoints.*--topic"),
         (Topics(camera_info="/ground_truth/poses", truth="/x"), "--camera-info-topic"),
         (Topics(truth="/camera_info", camera_info="/x"), "--ground-truth-topic"),
     ],
 )
-def test_topic_of_the_wrong_type(short, model_file, topics, clue):
+def test_topic_of_the_wrong_type(short, model_file, tmp_path, topics, clue):
     with pytest.raises(BagError, match=clue):
-        replay(short, open_stream(model_file), topics=topics)
+        replay(short, open_stream(model_file), tmp_path / "out.mcap", topics)
+    assert not list(tmp_path.iterdir())
+
+
+def test_output_that_cannot_be_written_is_told_before_anything_is_lifted(short, model_file, tmp_path):
+    for output, clue in (tmp_path, "it is a folder"), (Path("/proc/x.mcap"), "cannot write /proc/x.mcap"):
+        lifted = []
+        with pytest.raises(BagError, match=clue):
+            replay(short, open_stream(model_file), output, on_frame=lambda: lifted.append(1))
+        assert not lifted
+    assert not list(tmp_path.parent.glob(f"{tmp_path.name}*.part"))
 
 
 def test_output_over_the_input_is_refused(short, model_file):
@@ -242,6 +346,34 @@ def test_pictures(short, model_file, tmp_path):
 def test_picture_without_truth_or_camera(short, model_file, tmp_path, left_out):
     bag = part_of(short, tmp_path / "x.mcap", 9, without(left_out))
     write_picture(tmp_path / "x.png", replay(bag, open_stream(model_file)))
+    assert (tmp_path / "x.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("left_out", ["/nothing", "/camera_info"])
+@pytest.mark.parametrize(
+    "bag, value, points",
+    [
+        (TWO, np.nan, [11]),
+        (TWO, np.inf, [0, 12, 16]),
+        (ONE, np.nan, range(16)),
+        (ONE, -1e308, range(17)),
+        (ONE, 0.0, range(17)),
+    ],
+    ids=["no hip", "infinite", "one point", "far off", "zero"],
+)
+def test_picture_over_an_odd_truth(model_file, tmp_path, left_out, bag, value, points):
+    """Of the first person of every message; what cannot be drawn is left out."""
+    with BagWriter(tmp_path / "x.mcap") as writer:
+        for topic, _, message, time in list(read_messages(bag))[380:410]:
+            if topic == "/ground_truth/poses":
+                for point in points:
+                    where = message.poses[point].position
+                    where.x = where.y = where.z = value
+            if topic != left_out:
+                writer.write(topic, message, time)
+    done = replay(tmp_path / "x.mcap", open_stream(model_file))
+    assert all(np.isnan(truth[0, list(points)]).all() == bool(value) for truth in done.truth.values())
+    write_picture(tmp_path / "x.png", done)
     assert (tmp_path / "x.png").stat().st_size > 10_000
 
 

@@ -236,6 +236,8 @@ def test_an_unknown_name_is_answered_with_the_known_ones(name: str, advice: str)
         ({"names": ["a", "b"]}, "has 2 points"),
         ({"names": ["hinge_top", False, "handle", "latch"]}, "YAML reads it as False: put it in quotes"),
         ({"names": ["a", "", "c"]}, "must be text, not empty"),
+        ({"name": 12}, "YAML reads it as 12: put it in quotes"),
+        ({"name": 16**5000}, "YAML reads it as a number of 20001 bits"),
         ({"names": "hinge_top"}, "names must be a list, not str"),
         ({"name": None}, "name must be text, not NoneType"),
         ({"edges": [["hinge_top", "handel"]]}, "edges names 'handel', not in names"),
@@ -277,8 +279,11 @@ def test_a_missing_key_is_named(key: str) -> None:
         (b"a: !!python/object/apply:os.getcwd []", "no YAML"),
         (b"[" * 5000, "no YAML"),
         (b"#" * 1_000_001, "1000001 bytes"),
+        (b"name: 0x" + b"f" * 5000 + b"\nnames: [a, b, c]\nroot: a", "name must be text.*20000 bits"),
+        (b"? 0x" + b"f" * 5000 + b"\n: 1", "unknown key 'a number of 20000 bits'"),
+        (b"name: " + b"9" * 5000, "no YAML"),
     ],
-    ids=["empty", "list", "unclosed", "bytes", "python", "nested", "huge"],
+    ids=["empty", "list", "unclosed", "bytes", "python", "nested", "huge", "number", "key", "decimal"],
 )
 def test_a_file_that_is_no_layout_is_refused(tmp_path, content: bytes, message: str) -> None:
     path = tmp_path / "broken.yaml"

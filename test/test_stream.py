@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import array
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +58,29 @@ def test_units_follow_the_intrinsics(stream, make):
     stream.camera_info(camera_info(make, fx=0.0))
     assert stream.drops == {"bad_intrinsics": 1} and stream.describe()["units"] == "m"
     assert_lifts(stream, make)
+
+
+def test_the_description_says_which_matrix_of_camera_info_was_used(stream, make):
+    info = camera_info(make)
+    info.p = np.array([600, 0, 320, 0, 0, 600, 240, 0, 0, 0, 1.0, 0])
+    info.d = array.array("d", [-0.3, 0.1, 0, 0, 0])
+    stream.camera_info(info)
+    assert "CameraInfo's P" in stream.describe()["scale_source"] and not stream.notes
+    info.p = np.zeros(12)
+    stream.camera_info(info)
+    assert "CameraInfo's K" in stream.describe()["scale_source"]
+    assert "distortion is not corrected" in stream.describe()["scale_source"]
+    # Used all the same: it is a note, not a drop.
+    assert stream.notes == {"distorted_image": 1} and not stream.drops and stream.units == "m"
+    assert "rectify" in stream.explanations["distorted_image"]
+
+
+def test_persons_far_away_are_left_out_and_explained(stream, make):
+    stream.camera_info(camera_info(make))
+    stream.keypoints(CLOUD, cloud(make, seen(persons_at((0, 0, 4), (0, 0, 250), (0, 0, 2000)))))
+    assert stream.drops == {"person_too_far": 1, "person_degenerate_points": 1}
+    assert "200 m" in stream.explanations["person_too_far"]
+    assert "left out" in stream.explanations["person_degenerate_points"]
 
 
 def test_model_without_metres_stays_in_model_units(model_file, make):
@@ -135,6 +160,13 @@ def test_persons_that_cannot_be_lifted_are_left_out_and_counted(stream, make):
     np.testing.assert_array_equal(ids, [1, 3])
     assert stream.drops == {"person_too_few_points": 1}
     assert stream.counts == dict(frames=1, persons=3, lifted=2)
+
+
+def test_an_id_of_thousands_of_digits_is_its_row(stream, make):
+    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
+    frame = replace(frame, keypoints=replace(frame.keypoints, ids=("7", "1" * 5000)))
+    ids = np.frombuffer(frame.message("keypoints3d", make).data, "<f4").reshape(2, 17, 6)[:, 0, 5]
+    np.testing.assert_array_equal(ids, [7, 1])
 
 
 def test_nan_everywhere_is_a_frame_of_nobody_lifted(stream, make):

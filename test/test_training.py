@@ -12,7 +12,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from paul_ros.bag import BagWriter, read_records
+from msg_adapters.outputs import keypoints_cloud
+from paul_ros.bag import BagMessages, BagWriter, read_messages, read_records
 from paul_ros.model import load_model
 from paul_ros.onp import onp
 from paul_ros.replay import open_stream, replay
@@ -28,6 +29,7 @@ from training.solver import centre, solve_camera
 from training.trainer import Trainer, TrainingError
 
 COCO = load_layout("coco17")
+BAG = Path(__file__).parents[1] / "bags" / "one_person.mcap"
 SMALL = [
     "--set",
     "steps=12",
@@ -252,6 +254,10 @@ BAD_ARRAYS = {
     "all NaN": (dict(W=np.full((5, 2, 17), np.nan)), "nothing to train on"),
     "all at one place": (dict(W=np.full((5, 2, 17), 3.0)), "nothing to train on"),
     "huge": (dict(W=np.full((5, 2, 17), 1e30)), "no pixels"),
+    "flags in words": (dict(W=np.random.rand(5, 2, 17), visible=np.full((5, 17), "no")), "visible.*must be bool"),
+    "flags of NaN": (dict(W=np.random.rand(5, 2, 17), visible=np.full((5, 17), np.nan)), "visible.*must be bool"),
+    "calibrated in words": (dict(W=np.random.rand(5, 2, 17), calibrated=np.array("yes")), "calibrated.*must be bool"),
+    "pixels called rays": (dict(W=300 * np.random.rand(5, 2, 17), calibrated=np.array(True)), "no rays"),
     "pickled": (dict(W=np.array([{}, {}], dtype=object)), "plain arrays"),
 }
 
@@ -262,6 +268,21 @@ def test_bad_data_is_refused_before_the_first_step(tmp_path, case):
     np.savez(tmp_path / "bad.npz", **contents)
     with pytest.raises(DataError, match=message):
         load_training_data(tmp_path / "bad.npz", COCO)
+
+
+@pytest.mark.parametrize("contents", [b"", b"PK\x03\x04junk", b"\x93NUMPY\x01\x00v\x00{'descr'"])
+def test_files_that_are_no_npz_are_named(tmp_path, contents):
+    (tmp_path / "junk.npz").write_bytes(contents)
+    with pytest.raises(DataError, match="junk.npz"):
+        load_training_data(tmp_path / "junk.npz", COCO)
+
+
+def test_a_damaged_npz_is_named(data_file):
+    data = bytearray(data_file.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    data_file.write_bytes(data)
+    with pytest.raises(DataError, match="views.npz"):
+        load_training_data(data_file, COCO)
 
 
 def test_frames_with_too_few_points_are_left_out_and_counted(tmp_path):
@@ -275,6 +296,14 @@ def test_frames_with_too_few_points_are_left_out_and_counted(tmp_path):
 @pytest.mark.parametrize(
     "override,message",
     [
+        ("steps=[1", "YAML"),
+        ("steps=1.5", "steps"),
+        ("hidden=[a]", "hidden"),
+        ("hidden=[-3]", "hidden"),
+        ("hidden=[]", "hidden"),
+        ("learning_rate=.nan", "learning_rate"),
+        ("bone_weight=.inf", "bone_weight"),
+        ("code_weight=-1", "code_weight"),
         ("steps=many", "steps"),
         ("nonsense=1", "unknown"),
         ("batch", "key=value"),
@@ -308,9 +337,17 @@ def test_the_data_is_never_overwritten_by_the_model(data_file):
     assert data_file.read_bytes() == before
 
 
-def test_lengths_between_unknown_points_are_refused_before_training(data_file, tmp_path):
-    with pytest.raises(RecipeError, match="left_hoof"):
-        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", "known_lengths=[[left_hip, left_hoof, 0.4]]")
+@pytest.mark.parametrize("length", ["[left_hip, left_hoof, 0.4]", "[nose, nose, 1]", "[nose, left_eye, x]", "5"])
+def test_lengths_that_are_none_are_refused_before_training(data_file, tmp_path, length):
+    with pytest.raises(RecipeError, match="known_lengths"):
+        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", f"known_lengths=[{length}]")
+
+
+def test_fresh_deletes_nothing_but_the_run(data_file, tmp_path):
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL)
+    (tmp_path / "m.run" / "notes.txt").write_text("precious")
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", "seed=5", "--fresh")
+    assert (tmp_path / "m.run" / "notes.txt").read_text() == "precious"
 
 
 def test_shipped_recipes_load():
@@ -374,30 +411,44 @@ def test_cameras_keep_people_upright():
 
 
 def test_a_bag_is_learned_from_and_lifted_with(tmp_path):
-    bag = Path(__file__).parents[1] / "bags" / "one_person.mcap"
-    data = load_training_data(bag, COCO)
+    data = load_training_data(BAG, COCO)
     assert data.calibrated and len(data.W) == 585 and np.abs(data.W).max() < 1
-    train(bag, "-o", tmp_path / "mine.npz", *SMALL)
+    train(BAG, "-o", tmp_path / "mine.npz", *SMALL)
     stream = open_stream(str(tmp_path / "mine.npz"))
-    done = replay(bag, stream)
+    done = replay(BAG, stream)
     assert stream.counts["lifted"] == 585 and stream.units == "model"
     assert np.isfinite(done.frames[0].lifted.points).all()
 
 
 def test_a_bag_in_another_layout_says_which_would_fit(tmp_path):
-    bag = Path(__file__).parents[1] / "bags" / "one_person.mcap"
     with pytest.raises(DataError, match="no 2D keypoints of layout 'body25'.*17 keypoints"):
-        load_training_data(bag, load_layout("body25"))
+        load_training_data(BAG, load_layout("body25"))
 
 
 def test_of_several_topics_one_must_be_chosen(tmp_path):
     """The truth in our bags is a PoseArray too, but in 3D; a second topic of 2D keypoints leaves a choice."""
-    bag = Path(__file__).parents[1] / "bags" / "one_person.mcap"
     with BagWriter(tmp_path / "two.mcap") as out:
-        for record in read_records(bag, {"/keypoints"}):
+        for record in read_records(BAG, {"/keypoints"}):
             out.write_record(record)
             out.write_record(replace(record, topic="/other"))
     with pytest.raises(DataError, match="/keypoints, /other.*--topic"):
         load_training_data(tmp_path / "two.mcap", COCO)
     data = load_training_data(tmp_path / "two.mcap", COCO, "/other")
     assert not data.calibrated and np.abs(data.W).max() > 100
+
+
+def test_doubtful_keypoints_of_a_bag_count_as_hidden_and_a_wild_one_spoils_nothing(tmp_path):
+    make = BagMessages()
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(300, 600, (20, 1, 17, 2))
+    xy[0, 0, 0] = [9e5, 9e5]
+    confidence = np.where(np.arange(17) < 10, 0.9, 0.01)[None]
+    info = next(message for _, _, message, _ in read_messages(BAG, {"/camera_info"}))
+    with BagWriter(tmp_path / "detector.mcap", make) as bag:
+        bag.write("/camera_info", info, 0)
+        for stamp, points in enumerate(xy):
+            bag.write("/keypoints", keypoints_cloud(make, info.header, points, confidence, ["1"]), stamp)
+    data = load_training_data(tmp_path / "detector.mcap", COCO)
+    assert data.calibrated and len(data.W) == 20
+    assert data.visible[-19:, :10].all() and not data.visible[:, 10:].any()
+    assert load_training_data(tmp_path / "detector.mcap", COCO, min_confidence=0.0).visible[-19:].all()

@@ -11,12 +11,14 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from paul_ros.model import ModelError, write_atomically
+from paul_ros.files import write_atomically
+from paul_ros.model import ModelError
+from paul_ros.parameters import DEFAULTS
 from paul_ros.skeleton import LayoutError, load_layout
 from training.data import DataError, load_training_data
 from training.export import export_model
 from training.recipe import Recipe, RecipeError, recipe_names
-from training.trainer import Trainer, TrainingError
+from training.trainer import CHECKPOINT, LOG, Trainer, TrainingError
 
 ERRORS = (DataError, RecipeError, TrainingError, ModelError, LayoutError)
 """What a user can cause and mend; the text of each is one clear line."""
@@ -32,6 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--layout", default="coco17", help="layout of the points: a shipped name or a YAML file (default: %(default)s)"
     )
     parser.add_argument("--topic", help="topic of a bag, where it has several with 2D keypoints")
+    parser.add_argument(
+        "--min-confidence",
+        type=float,
+        default=DEFAULTS["min_confidence"],
+        metavar="C",
+        help="keypoints of a bag below it count as hidden, as in the node (default: %(default)s)",
+    )
     parser.add_argument(
         "--recipe", default="default", help=f"one of {', '.join(recipe_names())}, or a YAML file (default: %(default)s)"
     )
@@ -58,12 +67,12 @@ def run(args: argparse.Namespace) -> int:
         if output.resolve() == Path(args.data).resolve():
             raise DataError(f"'{output}' is the data that is trained on: name another output")
     recipe = Recipe.load(args.recipe, args.set)
-    data = load_training_data(args.data, load_layout(args.layout), args.topic)
+    data = load_training_data(args.data, load_layout(args.layout), args.topic, args.min_confidence)
     recipe.check_points(data.layout)
     folder = args.output.with_suffix(".run")
     if args.fresh:
-        for file in folder.glob("*"):
-            file.unlink()
+        for name in (CHECKPOINT, LOG):
+            (folder / name).unlink(missing_ok=True)
     torch.set_num_threads(max(1, args.threads))
     trainer = Trainer(data, recipe, folder)
     resumed = trainer.resume()

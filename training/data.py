@@ -7,7 +7,6 @@ Ground truth may lie in the same file; it is never opened here.
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import numpy as np
 
 import msg_adapters
 from paul_ros.model import min_visible
+from paul_ros.parameters import DEFAULTS
 from paul_ros.placement import centred_view
 from paul_ros.skeleton import Layout
 
@@ -57,7 +57,12 @@ class TrainingData:
         return digest.hexdigest()
 
 
-def load_training_data(path: str | Path, layout: Layout, topic: str | None = None) -> TrainingData:
+def load_training_data(
+    path: str | Path,
+    layout: Layout,
+    topic: str | None = None,
+    min_confidence: float = DEFAULTS["min_confidence"],
+) -> TrainingData:
     """Read 2D keypoints to train on.
 
     Args:
@@ -66,6 +71,7 @@ def load_training_data(path: str | Path, layout: Layout, topic: str | None = Non
             message type that has an adapter, calibrated where it holds a CameraInfo.
         layout: what the points are.
         topic: which topic of a bag; needed only where it has several.
+        min_confidence: keypoints of a bag with a lower one count as hidden, as in the node.
 
     Raises:
         DataError: nothing to train on, arrays that do not fit the layout, or values that are no image points.
@@ -74,23 +80,25 @@ def load_training_data(path: str | Path, layout: Layout, topic: str | None = Non
     path = Path(path)
     if not path.exists():
         raise DataError(f"no data at '{path}'")
-    reader = _read_npz if path.suffix == ".npz" else _read_bag
-    W, visible, calibrated = reader(path, layout, topic)
+    if path.suffix == ".npz":
+        W, visible, calibrated = _read_npz(path, layout)
+    else:
+        W, visible, calibrated = _read_bag(path, layout, topic, min_confidence)
     return _checked(W, visible, layout, calibrated, path)
 
 
-def _read_npz(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray, np.ndarray, bool]:
+def _read_npz(path: Path, layout: Layout) -> tuple[np.ndarray, np.ndarray, bool]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             if "W" not in archive.files:
                 raise DataError(f"'{path}' has no array W (F,2,P); it has {', '.join(archive.files) or 'none'}")
             W = archive["W"]
-            visible = archive["visible"] if "visible" in archive.files else None
-            calibrated = "calibrated" in archive.files and bool(archive["calibrated"].all())
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"'{path}' is no npz file of plain arrays: {error}") from error
+            visible = _flags(archive, "visible", path)
+            calibrated = _flags(archive, "calibrated", path)
+    except DataError:
+        raise
+    except Exception as error:  # numpy and zipfile report damage in a dozen ways
+        raise DataError(f"'{path}' is no npz file of plain arrays ({type(error).__name__}: {error})") from error
     if W.ndim != 3 or W.shape[1:] != (2, len(layout.names)) or W.dtype.kind not in "fiu":
         raise DataError(
             f"W in '{path}' must be numbers (F,2,{len(layout.names)}) for layout '{layout.name}', it is "
@@ -100,10 +108,22 @@ def _read_npz(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray
         visible = np.ones((len(W), W.shape[2]), bool)
     if visible.shape != (len(W), W.shape[2]):
         raise DataError(f"visible in '{path}' must be {(len(W), W.shape[2])} to go with W, it is {visible.shape}")
-    return W, visible.astype(bool), calibrated
+    return W, visible, calibrated is not None and calibrated.size == 1 and bool(calibrated.all())
 
 
-def _read_bag(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray, np.ndarray, bool]:
+def _flags(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> np.ndarray | None:
+    """An optional array of the file as bool; anything but bool, 0 and 1 is refused, not guessed."""
+    if name not in archive.files:
+        return None
+    flags = archive[name]
+    if flags.dtype.kind not in "biuf" or not np.isin(flags, (0, 1)).all():
+        raise DataError(f"{name} in '{path}' must be bool (or 0 and 1), it is {flags.dtype}")
+    return flags.astype(bool)
+
+
+def _read_bag(
+    path: Path, layout: Layout, topic: str | None, min_confidence: float
+) -> tuple[np.ndarray, np.ndarray, bool]:
     frames, camera, refused = _bag_keypoints(path, layout, topic)
     if not frames:
         raise DataError(
@@ -112,11 +132,14 @@ def _read_bag(path: Path, layout: Layout, topic: str | None) -> tuple[np.ndarray
     if len(frames) > 1:
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
     (seen,) = frames.values()
-    xy, visible = np.concatenate([frame.xy for frame in seen]), np.concatenate([frame.visible for frame in seen])
+    xy = np.concatenate([frame.xy for frame in seen])
+    visible = np.concatenate([frame.visible & (frame.confidence >= min_confidence) for frame in seen])
     if camera is None:
         return xy.transpose(0, 2, 1), visible, False
     some = visible.any(1)
-    return centred_view(xy[some], visible[some], camera).W, visible[some], True
+    W = centred_view(xy[some], visible[some], camera).W
+    # A wild detection far from the others is no reason to refuse the bag.
+    return W, visible[some] & (np.abs(W).max(1) < RAY_LIMIT), True
 
 
 def _bag_keypoints(

@@ -16,6 +16,7 @@ from paul_ros.skeleton import Layout
 from training.trainer import Trainer, predict_shapes, rule_share
 
 _MEAN_ROUNDS = 10
+_CLEAR = 0.95  # share of shapes on one side of the handedness rules that settles the chirality
 
 
 def export_model(trainer: Trainer, path: Path, command: str) -> dict:
@@ -84,7 +85,7 @@ def _chirality(shapes: np.ndarray, layout: Layout, weight: float) -> dict:
             "give the layout a handedness rule to settle it",
         }
     return {
-        "known": share > 0.5,
+        "known": share >= _CLEAR,
         "source": f"handedness rule of layout '{layout.name}', training weight {weight:g}",
         "training_share": round(share, 4),
     }

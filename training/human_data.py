@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from paul_ros.model import write_atomically
+from paul_ros.files import write_atomically
 from training.mocap import CMU31, coco17_from_cmu31
 
 HELD_OUT = ("02", "03", "27", "29", "01_12", "01_13", "01_14", "05_17", "05_18", "05_19", "05_20")
@@ -59,7 +59,7 @@ def read_clips(folder: Path) -> list[tuple[str, np.ndarray]]:
 def training_clips(clips: list[tuple[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
     """The clips that are neither held out nor copies of held-out ones under another name."""
     held_out = [joints for name, joints in clips if name.startswith(HELD_OUT)]
-    known = np.concatenate([_limb_angles(joints) for joints in held_out])
+    known = np.concatenate([_limb_angles(joints) for joints in held_out] or [np.full((1, 28), np.inf)])
     return [(name, joints) for name, joints in clips if not name.startswith(HELD_OUT) and not _is_copy(joints, known)]
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -54,35 +55,41 @@ class Recipe:
             key, equals, value = override.partition("=")
             if not equals:
                 raise RecipeError(f"'{override}' is no override: write key=value")
-            settings[key.strip()] = yaml.safe_load(value)
+            settings[key.strip()] = _parsed(value, f"the value in '{override}'")
         return cls.from_dict(settings)
 
     @classmethod
     def from_dict(cls, settings: dict) -> Recipe:
         """Check and build; raises RecipeError."""
         fields = {field.name: field for field in dataclasses.fields(cls)}
-        unknown = sorted(set(settings) - set(fields))
+        unknown = sorted(str(key) for key in settings if key not in fields)
         if unknown:
             raise RecipeError(f"unknown recipe setting {', '.join(unknown)}; known are {', '.join(fields)}")
         return cls(**{key: _converted(key, value, fields[key].default) for key, value in settings.items()})
 
     def __post_init__(self) -> None:
         for name in ("bottleneck", "width", "blocks", "steps", "batch", "learning_rate"):
-            if getattr(self, name) <= 0:
-                raise RecipeError(f"recipe setting {name} must be positive, it is {getattr(self, name)}")
-        numbers = all(type(share) in (int, float) for share in self.fade)
-        if len(self.fade) != 2 or not numbers or not 0 <= self.fade[0] <= self.fade[1]:
-            raise RecipeError(f"recipe setting fade must be two growing shares, it is {list(self.fade)}")
-        if not 0 <= self.hide < 1:
-            raise RecipeError(f"recipe setting hide must be in [0, 1), it is {self.hide}")
+            self._need(name, getattr(self, name) > 0, "positive")
+        for name in ("code_weight", "decay_weight", "handedness_weight", "bone_weight", "roll"):
+            self._need(name, getattr(self, name) >= 0, "at least 0")
+        self._need("hidden", self.hidden and all(type(size) is int and size > 0 for size in self.hidden), "layer sizes")
+        shares = [share for share in self.fade if type(share) in (int, float)]
+        self._need("fade", len(shares) == len(self.fade) == 2 and 0 <= shares[0] <= shares[1], "two growing shares")
+        self._need("hide", 0 <= self.hide < 1, "in [0, 1)")
+
+    def _need(self, name: str, holds: object, what: str) -> None:
+        if not holds:
+            raise RecipeError(f"recipe setting {name} must be {what}, it is {getattr(self, name)!r}")
 
     def check_points(self, layout: Layout) -> None:
-        """Refuse known lengths between points that the layout does not have; raises RecipeError."""
+        """Refuse known lengths that are none between two points of the layout; raises RecipeError."""
         for length in self.known_lengths:
-            if len(length) != 3 or not {*length[:2]} <= {*layout.names} or not 0 < length[2] < 1e3:
+            a, b, metres = length if isinstance(length, tuple) and len(length) == 3 else (None, None, None)
+            between = a in layout.names and b in layout.names and a != b
+            if not between or type(metres) not in (int, float) or not 0 < metres < 1e3:
                 raise RecipeError(
-                    f"known_lengths must be [point, point, metres] with points of layout '{layout.name}', "
-                    f"one is {list(length)}"
+                    f"known_lengths must be [point, point, metres] with two points of layout '{layout.name}', "
+                    f"one is {length!r}"
                 )
 
     def to_dict(self) -> dict:
@@ -106,13 +113,17 @@ def _read(name_or_path: str | Path) -> dict:
     path = resources.files("training") / "recipes" / f"{text}.yaml" if text in recipe_names() else Path(text)
     if not path.is_file():
         raise RecipeError(f"no recipe '{text}': neither a file nor one of {', '.join(recipe_names())}")
-    try:
-        settings = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RecipeError(f"recipe '{text}' is no YAML: {error}") from error
+    settings = _parsed(path.read_bytes(), f"recipe '{text}'")
     if settings is not None and not isinstance(settings, dict):
         raise RecipeError(f"recipe '{text}' must be settings as key: value")
     return settings or {}
+
+
+def _parsed(text: str | bytes, what: str) -> object:
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise RecipeError(f"{what} is no YAML: {' '.join(str(error).split())[:200]}") from None
 
 
 def _converted(key: str, value: object, default: object) -> object:
@@ -121,13 +132,11 @@ def _converted(key: str, value: object, default: object) -> object:
         return tuple(tuple(item) if isinstance(item, list) else item for item in value)
     if isinstance(default, bool) and isinstance(value, bool):
         return value
-    if type(default) in (int, float) and type(value) in (int, float):
-        if type(default) is float or float(value).is_integer():
-            return type(default)(value)
-    # YAML 1.1 reads 1e-3 as text.
-    if isinstance(default, float) and isinstance(value, str):
+    if type(default) in (int, float) and type(value) in (int, float, str):
         try:
-            return float(value)
+            number = float(value)  # YAML 1.1 reads 1e-3 as text
         except ValueError:
-            pass
+            number = math.nan
+        if math.isfinite(number) and (type(default) is float or number.is_integer()):
+            return type(default)(number)
     raise RecipeError(f"recipe setting {key} must be like {default!r}, it is {value!r}")

@@ -13,13 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from paul_ros.model import min_visible, normalise, write_atomically
+from paul_ros.files import write_atomically
+from paul_ros.model import min_visible, normalise
 from paul_ros.skeleton import Layout
 from training.data import TrainingData
 from training.networks import Paul
 from training.objective import Terms, Views, paul_terms
 from training.recipe import Recipe
 
+CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
 LOG_COLUMNS = ("step", "seconds", "loss", "recon_ae", "recon_ad", "code", "handedness", "bones", "learning_rate")
 _LOG_EVERY = 100
 _CHECKPOINT_SECONDS = 30.0
@@ -53,7 +55,7 @@ class Trainer:
     @property
     def checkpoint(self) -> Path:
         """Where the run is kept."""
-        return self.folder / "checkpoint.pt"
+        return self.folder / CHECKPOINT
 
     def resume(self) -> bool:
         """Continue from the folder's checkpoint; False where there is none.
@@ -115,7 +117,7 @@ class Trainer:
         write_atomically(self.checkpoint, buffer.getvalue())
         log = io.StringIO()
         csv.writer(log).writerows([LOG_COLUMNS, *self.rows])
-        write_atomically(self.folder / "log.csv", log.getvalue().encode())
+        write_atomically(self.folder / LOG, log.getvalue().encode())
 
     def _advance(self, begun: float) -> dict[str, float]:
         """One optimisation step."""
