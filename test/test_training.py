@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.outputs import keypoints_cloud
-from paul_ros.bag import BagMessages, BagWriter, read_messages, read_records
+from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records
 from paul_ros.model import load_model
 from paul_ros.onp import onp
 from paul_ros.replay import open_stream, replay
@@ -452,3 +452,10 @@ def test_doubtful_keypoints_of_a_bag_count_as_hidden_and_a_wild_one_spoils_nothi
     assert data.calibrated and len(data.W) == 20
     assert data.visible[-19:, :10].all() and not data.visible[:, 10:].any()
     assert load_training_data(tmp_path / "detector.mcap", COCO, min_confidence=0.0).visible[-19:].all()
+
+
+def test_an_output_that_cannot_be_written_stops_the_run_before_it_begins(data_file, tmp_path):
+    (tmp_path / "folder.npz").mkdir()
+    with pytest.raises(BagError, match="folder"):
+        train(data_file, "-o", tmp_path / "folder.npz", *SMALL)
+    assert not (tmp_path / "folder.run").exists()

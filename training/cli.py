@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from paul_ros.bag import BagError, check_output
 from paul_ros.files import write_atomically
 from paul_ros.model import ModelError
 from paul_ros.parameters import DEFAULTS
@@ -20,7 +21,7 @@ from training.export import export_model
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.trainer import CHECKPOINT, LOG, Trainer, TrainingError
 
-ERRORS = (DataError, RecipeError, TrainingError, ModelError, LayoutError)
+ERRORS = (BagError, DataError, RecipeError, TrainingError, ModelError, LayoutError)
 """What a user can cause and mend; the text of each is one clear line."""
 
 
@@ -66,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
     for output in filter(None, (args.output, args.json)):
         if output.resolve() == Path(args.data).resolve():
             raise DataError(f"'{output}' is the data that is trained on: name another output")
+        check_output(output)
     recipe = Recipe.load(args.recipe, args.set)
     data = load_training_data(args.data, load_layout(args.layout), args.topic, args.min_confidence)
     recipe.check_points(data.layout)
