@@ -113,7 +113,7 @@ class Lifter:
         pose = onp(S, W, visible)
         if camera is not None:
             # Once is enough: it leaves half a pixel and 5 mm of a person 2.5 m away, a tenth of that at 6 m.
-            pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible, start=pose.R)
+            pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible)
         fixed = pose.determined & (pose.scale > 0) & (camera is None or _extent(xy, visible) >= MIN_EXTENT)
         near = np.ones(len(xy), bool)
         camera_shape = pose.R @ S

@@ -14,9 +14,10 @@ the cost is a constant minus
     free scale:  g(n) = T(n) / (tr A - n^T A n)
 
 so both problems are the maximisation of a smooth function on the sphere.  It is climbed by Newton steps from the
-algebraic solution.  A quadratic in n that touches g at the optimum and bounds it from above makes a certificate: a
-quadratic on the sphere has no other maximum when its Hessian, shifted by the multiplier, is negative semidefinite
-(the trust-region theorem of More and Sorensen, 1983).  In the free-scale problem the condition is also necessary.
+algebraic solution; the free-scale problem has a shorter way, taken first (``_lagrange_optimum``).  A quadratic in n
+that touches g at the optimum and bounds it from above makes a certificate: a quadratic on the sphere has no other
+maximum when its Hessian, shifted by the multiplier, is negative semidefinite (the trust-region theorem of More and
+Sorensen, 1983).  In the free-scale problem the condition is also necessary.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ MIN_POINTS = 3
 """Fewer weighted points than this leave the pose undetermined."""
 
 _NEWTON_STEPS = 30
+_LAGRANGE_STEPS = 12
 _STEP_LIMIT = 0.5  # radians: keeps Newton inside the basin it started in
 _SEARCH_DIRECTIONS = 256
 
@@ -46,7 +48,8 @@ class OnP:
         residual: (N,) weighted root mean square distance to W, image units.
         certified: (N,) bool, the pose is proven globally optimal.
         determined: (N,) bool, False where the points fix no pose (too few, or all on one line): R is then the identity.
-        R_mirror, scale_mirror, residual_mirror: the second (Necker-reversed) optimum and its residual.
+        R_mirror, scale_mirror, residual_mirror: the rival pose, the Necker reversal of the optimum (reflected about the
+            axis along which the shape is thinnest, best scale), and its residual.
     """
 
     R: np.ndarray
@@ -71,7 +74,6 @@ def onp(
     W: np.ndarray,
     weights: np.ndarray | None = None,
     scale: Literal["free", "unit"] = "free",
-    start: np.ndarray | None = None,
 ) -> OnP:
     """Solve N orthographic-N-point problems.
 
@@ -80,7 +82,6 @@ def onp(
         W: (N,2,P) image points, any unit.
         weights: (N,P) non-negative; bool visibility works. Points of weight 0 are ignored, NaN or not.
         scale: ``"free"`` solves for the scale of weak perspective, ``"unit"`` fixes it to 1.
-        start: (N,3,3) rotations to climb from, of nearly the same problems; saves time. Default: least squares.
 
     Returns:
         The optimum of every problem; degenerate input is flagged in ``determined``, never NaN.
@@ -90,17 +91,13 @@ def onp(
     """
     problem = _Problem.of(S, W, weights)
     goal = _GOALS[scale]
-    n, mirror = _two_optima(goal, problem, _algebraic_direction(problem) if start is None else start[:, 2])
-    certified = _certify(goal, problem, n)
-    doubtful = problem.determined & ~certified
-    if doubtful.any():
-        hard = problem.select(doubtful)
-        n[doubtful], mirror[doubtful] = _two_optima(goal, hard, _search(goal, hard, n[doubtful]))
-        certified[doubtful] = _certify(goal, hard, n[doubtful])
-    # Where the climb from the mirrored start fell back to the optimum there is no second optimum: the reflected pose
-    # itself is then the competitor whose residual tells how clear the decision was.
-    merged = _dot(n, mirror) > 1 - 1e-6
-    mirror = np.where(merged[:, None], _necker(problem, n), mirror)
+    n, certified = np.tile([0.0, 0.0, 1.0], (len(problem.A), 1)), np.zeros(len(problem.A), bool)
+    if scale == "free":
+        n, certified = _lagrange_optimum(problem)
+    rest = problem.determined & ~certified
+    if rest.any():
+        n[rest], certified[rest] = _climbed_optimum(goal, problem.select(rest))
+    mirror = _necker(problem, n)
     R, s, residual = (np.split(part, 2) for part in _pose(problem.twice(), np.concatenate([n, mirror]), scale))
     return OnP(
         R=R[0],
@@ -131,7 +128,9 @@ class _Problem:
     D: np.ndarray
     trace_A: np.ndarray
     trace_D: np.ndarray
-    thin: np.ndarray  # (N,3) the axis along which the shape is thinnest
+    a: np.ndarray  # (N,3) eigenvalues of A, growing
+    V: np.ndarray  # (N,3,3) eigenvectors of A, columns; the first is the axis along which the shape is thinnest
+    d: np.ndarray  # (N,3) b1 + i b2 in that basis
     determined: np.ndarray
 
     @classmethod
@@ -172,7 +171,9 @@ class _Problem:
             D,
             np.trace(A, axis1=1, axis2=2),
             np.trace(D, axis1=1, axis2=2),
-            axes[:, :, 0],
+            spread,
+            axes,
+            _times(axes.transpose(0, 2, 1), B[:, 0] + 1j * B[:, 1]),
             determined,
         )
 
@@ -246,7 +247,7 @@ def _facing(p: _Problem, n: np.ndarray) -> np.ndarray:
 
 def _necker(p: _Problem, n: np.ndarray) -> np.ndarray:
     """The Necker reversal of n: reflected about the axis along which the shape is thinnest."""
-    return _facing(p, 2 * _dot(p.thin, n)[:, None] * p.thin - n)
+    return _facing(p, 2 * _dot(p.V[:, :, 0], n)[:, None] * p.V[:, :, 0] - n)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -263,11 +264,64 @@ def _tangent(n: np.ndarray) -> np.ndarray:
     return np.stack([1 + sign * x * x * a, b, sign * b, sign + y * y * a, -sign * x, -y], axis=1).reshape(-1, 3, 2)
 
 
-def _two_optima(goal: Goal, p: _Problem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The better and the worse of the maxima reached from a start and from its Necker reversal, in one climb."""
+def _climbed_optimum(goal: Goal, p: _Problem) -> tuple[np.ndarray, np.ndarray]:
+    """The best maximum found, and whether it is certified: from least squares, its Necker reversal, else by search."""
+    n = _two_climbs(goal, p, _algebraic_direction(p))
+    certified = _certify(goal, p, n)
+    doubtful = p.determined & ~certified
+    if doubtful.any():
+        hard = p.select(doubtful)
+        n[doubtful] = _two_climbs(goal, hard, _search(goal, hard, n[doubtful]))
+        certified[doubtful] = _certify(goal, hard, n[doubtful])
+    return n, certified
+
+
+def _two_climbs(goal: Goal, p: _Problem, start: np.ndarray) -> np.ndarray:
+    """The better of the maxima reached from a start and from its Necker reversal, in one climb."""
     both = p.twice()
     ends = _ascend(goal, both, np.concatenate([start, _necker(p, start)]))
-    return _better_first(goal, p, *np.split(ends, 2))
+    return _better_first(goal, p, *np.split(ends, 2))[0]
+
+
+# --- the free-scale problem as three complex unknowns
+
+
+def _lagrange_optimum(p: _Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Optimum of the free-scale problem (N,3) and whether it is certified.
+
+    With q = s (r1 + i r2) the problem is: minimise q^H A q - 2 Re q^H d, d = b1 + i b2, under q^T q = 0.  In A's
+    eigenbasis a stationary point has q_k = (a_k d_k - mu conj(d_k)) / (a_k^2 - |mu|^2) with one complex multiplier mu,
+    found by Newton on q^T q = 0 from 0, which is least squares.  Where |mu| is at most the least a_k the Lagrangian is
+    convex: a global optimum.
+    """
+    q, mu, converged = _lagrange(p)
+    n = _cross(q.real, q.imag)
+    length = np.sqrt(_dot(n, n))
+    certified = converged & (np.abs(mu) <= p.a[:, 0]) & p.determined & (length > 0)
+    ahead = np.array([0.0, 0.0, 1.0])
+    return np.where(certified[:, None], n / np.where(certified, length, 1.0)[:, None], ahead), certified
+
+
+def _lagrange(p: _Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Newton on q^T q = 0: q (N,3) in the shape's frame, the multiplier (N,), and whether it converged."""
+    mu = np.zeros(len(p.a), complex)
+    a, d = p.a, p.d
+    conj_d, ad, aa = d.conj(), a * d, a * a
+    with np.errstate(all="ignore"):
+        for _ in range(_LAGRANGE_STEPS):
+            m = mu[:, None]
+            gap = aa - (m * m.conj()).real
+            q = (ad - m * conj_d) / gap
+            qq = q * q
+            residue = qq.sum(1)
+            converged = np.abs(residue) <= 1e-12 * (q.real**2 + q.imag**2).sum(1)
+            if converged.all():
+                break
+            slope = 2 * (q * (q * m.conj() - conj_d) / gap).sum(1)
+            twist = 2 * mu * (qq / gap).sum(1)
+            step = (residue.conj() * twist - residue * slope.conj()) / (np.abs(slope) ** 2 - np.abs(twist) ** 2)
+            mu = np.where(converged, mu, mu + step)
+    return (p.V @ q[..., None])[..., 0], mu, converged
 
 
 def _ascend(goal: Goal, p: _Problem, n: np.ndarray) -> np.ndarray:
