@@ -9,7 +9,7 @@ import numpy as np
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.model import Model
-from paul_ros.onp import onp
+from paul_ros.onp import OnP, onp
 from paul_ros.placement import centred_view, place, undo_perspective
 
 TOO_FEW_POINTS = "too_few_points"
@@ -101,41 +101,42 @@ class Lifter:
         return xy, visible & np.isfinite(xy).all(2)
 
     def _lift_rows(self, xy, visible, camera, rows, lifted) -> np.ndarray:
-        """Fill the given rows of the output arrays; returns the reasons of those that came out undetermined."""
-        if camera is None:
-            W, turn, pixels = xy.transpose(0, 2, 1), None, 1.0
-        else:
+        """Fill the given rows of the output arrays; returns why the others of them were not lifted, '' where done."""
+        W, turn, pixels = xy.transpose(0, 2, 1), None, 1.0
+        if camera is not None:
             view = centred_view(xy, visible, camera)
             W, turn, pixels = view.W, view.turn, (camera.fx + camera.fy) / 2
             visible = visible & np.isfinite(W).all(1)
-        enough = visible.sum(1) >= self.model.min_visible  # again: points may lie beyond the virtual camera's horizon
         S = self.model.shape(W, visible).astype(float)
         pose = onp(S, W, visible)
         if camera is not None:
             # Once is enough: it leaves half a pixel and 5 mm of a person 2.5 m away, a tenth of that at 6 m.
             pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible)
+        enough = visible.sum(1) >= self.model.min_visible  # again: a virtual camera does not see all points
         fixed = pose.determined & (pose.scale > 0) & (camera is None or _extent(xy, visible) >= MIN_EXTENT)
-        near = np.ones(len(xy), bool)
-        camera_shape = pose.R @ S
-        root = list(self.model.layout.root)
-        if lifted["units"] == "m":
-            scale = np.where(fixed, pose.scale, 1.0)
-            points = place(camera_shape, scale, pose.translation, turn, self.model.metres_per_unit)
-            rotation = turn @ pose.R
-            near = np.abs(points).max((1, 2)) <= MAX_DISTANCE
-        else:
-            points = (camera_shape - camera_shape[:, :, root].mean(2, keepdims=True)).transpose(0, 2, 1)
-            rotation = pose.R if turn is None else turn @ pose.R
+        points = self._placed(pose, S, fixed, turn if lifted["units"] == "m" else None)
+        near = (np.abs(points) <= MAX_DISTANCE).all((1, 2)) if lifted["units"] == "m" else True
         done = enough & fixed & near
-        rows = rows[done]
-        lifted["points"][rows] = points[done]
-        lifted["root"][rows] = points[done][:, root].mean(1)
-        lifted["rotation"][rows] = rotation[done]
-        lifted["scale"][rows] = pose.scale[done] * pixels
-        lifted["reprojection"][rows] = pose.residual[done] * pixels
-        lifted["ambiguity"][rows] = pose.ambiguity[done]
-        lifted["certified"][rows] = pose.certified[done]
-        return np.select([done, ~enough, ~fixed], ["", TOO_FEW_POINTS, DEGENERATE_POINTS], TOO_FAR)
+        root = list(self.model.layout.root)
+        for name, value in (
+            ("points", points),
+            ("root", points[:, root].mean(1)),
+            ("rotation", pose.R if turn is None else turn @ pose.R),
+            ("scale", pose.scale * pixels),
+            ("reprojection", pose.residual * pixels),
+            ("ambiguity", pose.ambiguity),
+            ("certified", pose.certified),
+        ):
+            lifted[name][rows[done]] = value[done]
+        return np.where(~enough, TOO_FEW_POINTS, np.where(~fixed, DEGENERATE_POINTS, np.where(done, "", TOO_FAR)))
+
+    def _placed(self, pose: OnP, S: np.ndarray, fixed: np.ndarray, turn: np.ndarray | None) -> np.ndarray:
+        """Points (N,P,3): in metres where the camera's turn is given, else in model units from the root."""
+        shape = pose.R @ S
+        if turn is None:
+            return (shape - shape[:, :, list(self.model.layout.root)].mean(2, keepdims=True)).transpose(0, 2, 1)
+        scale = np.where(fixed, pose.scale, 1.0)
+        return place(shape, scale, pose.translation, turn, self.model.metres_per_unit)
 
 
 def _extent(xy: np.ndarray, visible: np.ndarray) -> np.ndarray:
