@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Iterator
+from typing import Any, BinaryIO, Iterable, Iterator
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 # A recorder that is killed loses its open chunk: small chunks lose about a second of keypoints.
@@ -210,6 +210,25 @@ def check_output(path: Path) -> None:
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
         raise BagError(f"cannot write {path}: {error.strerror}") from error
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[str | Path | None]) -> None:
+    """Raises BagError where an output would overwrite an input (or a file of a bag folder) or another output.
+
+    Or where it cannot be written at all; None stands for an output or input that was not asked for.
+    """
+    sources = [Path(source).resolve() for source in inputs if source is not None and Path(source).exists()]
+    taken: set[Path] = set()
+    for output in filter(None, outputs):
+        written = output.resolve()
+        for read in sources:
+            part = read in written.parents and (written.suffix == ".mcap" or written.name == "metadata.yaml")
+            if written == read or part:
+                raise BagError(f"{output}: is {'part of ' if part else ''}what is read; name another output")
+        if written in taken:
+            raise BagError(f"{output}: is named for two outputs; name another one")
+        taken.add(written)
+        check_output(output)
 
 
 def _need(module: str) -> None:

@@ -72,13 +72,11 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
 
 
 def _replay(args: argparse.Namespace) -> None:
-    from paul_ros.bag import BagError, check_output
-    from paul_ros.replay import Topics, evaluate, open_stream, replay, spare
+    from paul_ros.bag import BagError, check_outputs
+    from paul_ros.replay import Topics, evaluate, open_stream, replay
     from paul_ros.report import table, write_json, write_picture
 
-    for output in filter(None, (args.output, args.json, args.plot)):
-        spare(args.bag, output)
-        check_output(output)
+    check_outputs([args.output, args.json, args.plot], [args.bag, args.model, args.layout])
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic)
     with Ticker("replay") as tick:
         done = replay(args.bag, open_stream(args.model, args.layout), args.output, topics, tick)
@@ -112,9 +110,11 @@ def _add_inspect(commands: argparse._SubParsersAction) -> None:
 
 
 def _inspect(args: argparse.Namespace) -> None:
+    from paul_ros.bag import check_outputs
     from paul_ros.inspection import as_text, inspect
     from paul_ros.report import write_json
 
+    check_outputs([args.json], [args.thing])
     summary, damage = inspect(args.thing)
     if args.json:
         write_json(args.json, summary)

@@ -29,6 +29,7 @@ DEFAULT_MODEL = "human_coco17"
 _DIGEST_CHARS = 64
 _MAX_BYTES = 64 * 2**20
 _MAX_LAYERS = 100
+_MAX_WIDTH = 2**14
 
 
 class ModelError(ValueError):
@@ -248,10 +249,21 @@ def _check_architecture(header: dict) -> None:
     if (encoder["kind"], decoder["kind"]) != ("residual", "mlp"):
         raise ValueError(f"unknown architecture {encoder['kind']!r}, {decoder['kind']!r}")
     sizes = [header["bottleneck"], encoder["width"], *decoder["hidden"]]
-    if not all(type(size) is int and 0 < size <= 2**14 for size in [*sizes, encoder["blocks"]]):
-        raise ValueError("layer sizes must be positive whole numbers")
+    if not all(type(size) is int and 0 < size <= _MAX_WIDTH for size in [*sizes, encoder["blocks"]]):
+        raise ValueError(f"layer sizes must be whole numbers from 1 to {_MAX_WIDTH}")
     if len(sizes) > _MAX_LAYERS or encoder["blocks"] > _MAX_LAYERS:
         raise ValueError(f"more than {_MAX_LAYERS} layers")
+
+
+def check_size(header: dict, points: int) -> None:
+    """Refuse an architecture whose model file could not be loaded; raises ModelError, before any training."""
+    try:
+        _check_architecture(header)
+        bytes_ = 4 * sum(math.prod(shape) for shape in weight_shapes(header, points).values())
+        if bytes_ > 0.9 * _MAX_BYTES:
+            raise ValueError(f"{bytes_ / 2**20:.0f} MiB of weights, a model file holds at most {_MAX_BYTES >> 20}")
+    except ValueError as error:
+        raise ModelError(f"a model of this recipe could not be loaded: {error}") from None
 
 
 def save_model(path: str | os.PathLike, header: dict, arrays: dict[str, np.ndarray]) -> None:

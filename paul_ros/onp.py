@@ -47,7 +47,8 @@ class OnP:
         translation: (N,2) image units: ``W ~ scale * R[:, :2] @ S + translation``.
         residual: (N,) weighted root mean square distance to W, image units.
         certified: (N,) bool, the pose is proven globally optimal.
-        determined: (N,) bool, False where the points fix no pose (too few, or all on one line): R is then the identity.
+        determined: (N,) bool, False where the points fix no pose: too few, all on one line, or one of them not finite;
+            R is then the identity.
         R_mirror, scale_mirror, residual_mirror: the rival pose, the Necker reversal of the optimum (reflected about the
             axis along which the shape is thinnest, best scale), and its residual.
     """
@@ -64,7 +65,10 @@ class OnP:
 
     @property
     def ambiguity(self) -> np.ndarray:
-        """(N,) in 0..1: residual over the mirrored pose's; 1 means that the image cannot tell the two apart."""
+        """(N,) in 0..1: residual over the mirrored pose's; 1 means that the image cannot tell the two apart.
+
+        A lower bound where the reversal is not itself the best pose of its side, which matters for few points only.
+        """
         tiny = np.finfo(float).tiny
         return np.where(self.residual_mirror > tiny, self.residual / np.maximum(self.residual_mirror, tiny), 1.0)
 
@@ -142,6 +146,9 @@ class _Problem:
         if w.shape != (S.shape[0], S.shape[2]):
             raise ValueError(f"onp needs weights (N,P) = {(S.shape[0], S.shape[2])}, got {w.shape}")
         used = w > 0
+        finite = (np.isfinite(S).all(1) & np.isfinite(W).all(1) & np.isfinite(w) | ~used).all(1)
+        used = used & finite[:, None]
+        w = np.where(used, w, 0.0)
         S, W = np.where(used[:, None], S, 0.0), np.where(used[:, None], W, 0.0)
         w = w / np.maximum(w.sum(1, keepdims=True), np.finfo(float).tiny)
         S_mean, W_mean = np.einsum("nip,np->ni", S, w), np.einsum("nip,np->ni", W, w)
@@ -321,6 +328,7 @@ def _lagrange(p: _Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             twist = 2 * mu * (qq / gap).sum(1)
             step = (residue.conj() * twist - residue * slope.conj()) / (np.abs(slope) ** 2 - np.abs(twist) ** 2)
             mu = np.where(converged, mu, mu + step)
+        q = np.where(converged[:, None], q, 0.0)  # infinite where an axis has no thickness
     return (p.V @ q[..., None])[..., 0], mu, converged
 
 

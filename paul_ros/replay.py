@@ -20,7 +20,7 @@ import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D
 from msg_adapters.keypoints import stamp_ns
 from paul_ros import __version__, metrics
-from paul_ros.bag import LATCHED_QOS, BagError, BagMessages, BagWriter, Record, read_records, topics_of
+from paul_ros.bag import LATCHED_QOS, BagError, BagMessages, BagWriter, Record, check_outputs, read_records, topics_of
 from paul_ros.lifter import AMBIGUOUS, Lifted, Lifter
 from paul_ros.model import load_model
 from paul_ros.parameters import PARAMETERS
@@ -106,16 +106,6 @@ def open_stream(model: str | None = None, layout: str | None = None) -> LiftStre
     )
 
 
-def spare(bag: Path, output: Path | None) -> None:
-    """Raises BagError where writing the output would overwrite the bag that is read, or a file of it."""
-    if output is None or not bag.exists():
-        return
-    read, written = bag.resolve(), output.resolve()
-    part = read in written.parents and (written.suffix == ".mcap" or written.name == "metadata.yaml")
-    if written == read or part:
-        raise BagError(f"{output}: is {'part of ' if part else ''}the bag that is read; name another output")
-
-
 def replay(
     bag: Path,
     stream: LiftStream,
@@ -128,7 +118,7 @@ def replay(
     A bag damaged somewhere in the middle is lifted up to there: `out` is then whole and says what was read, and the
     result names the damage. Raises BagError where nothing can be read, or nothing there is to be lifted.
     """
-    spare(bag, out)
+    check_outputs([out], [bag])
     done = Replay(bag, stream)
     with BagWriter(out) if out else contextlib.nullcontext() as writer:
         shell = _Shell(done, topics, writer)

@@ -204,3 +204,22 @@ def test_training_is_imported_only_to_train():
         "assert not loaded, loaded"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["inspect", "{bag}", "--json", "{bag}"],
+        ["inspect", "{model}", "--json", "{model}"],
+        ["replay", "{bag}", "--model", "{model}", "--json", "{model}"],
+        ["replay", "{bag}", "-o", "{out}", "--json", "{out}"],
+    ],
+)
+def test_no_output_overwrites_an_input_or_another_output(words, model_file, tmp_path, capsys):
+    places = {"bag": tmp_path / "a.mcap", "model": tmp_path / "m.npz", "out": tmp_path / "o"}
+    places["bag"].write_bytes(ONE.read_bytes())
+    places["model"].write_bytes(model_file.read_bytes())
+    assert cli.main([word.format(**places) for word in words]) == 1
+    assert "another" in capsys.readouterr().err
+    assert places["bag"].read_bytes() == ONE.read_bytes() and places["model"].read_bytes() == model_file.read_bytes()
+    assert not places["out"].exists()

@@ -126,6 +126,19 @@ def test_degenerate_input_is_flagged_and_finite(scale, case):
     assert np.isfinite(found.ambiguity).all()
 
 
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_visible_points_that_are_not_finite_spoil_their_own_row_only(scale, bad):
+    S, W, _ = random_problems(3, 8, 0.1, seed=11)
+    good = onp(S, W, scale=scale)
+    S[0, 1, 2], W[1, 0, 3] = bad, bad
+    found = onp(S, W, scale=scale)
+    np.testing.assert_array_equal(found.determined, [False, False, True])
+    np.testing.assert_allclose(found.R[2], good.R[2])
+    for value in vars(found).values():
+        assert np.isfinite(value).all()
+
+
 def test_no_problems_give_no_poses():
     assert onp(np.empty((0, 3, 5)), np.empty((0, 2, 5))).R.shape == (0, 3, 3)
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records
-from paul_ros.model import load_model
+from paul_ros.model import ModelError, load_model
 from paul_ros.onp import onp
 from paul_ros.replay import open_stream, replay
 from paul_ros.skeleton import load_layout
@@ -332,9 +332,28 @@ def test_view_augmentation_fades_as_the_recipe_says(data_file, tmp_path, fade, s
 
 def test_the_data_is_never_overwritten_by_the_model(data_file):
     before = data_file.read_bytes()
-    with pytest.raises(DataError, match="another output"):
+    with pytest.raises(BagError, match="another output"):
         train(data_file, "-o", data_file, *SMALL)
+    with pytest.raises(BagError, match="another"):
+        train(data_file, "-o", data_file.with_name("m.npz"), "--json", data_file.with_name("m.npz"), *SMALL)
     assert data_file.read_bytes() == before
+
+
+@pytest.mark.parametrize("override", ["width=5000", "blocks=101", "bottleneck=20000"])
+def test_models_that_could_not_be_loaded_are_refused_before_training(data_file, tmp_path, override):
+    with pytest.raises(ModelError, match="could not be loaded"):
+        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", override)
+    assert not list((tmp_path / "m.run").glob("*"))
+
+
+def test_a_bag_of_two_cameras_is_refused(tmp_path):
+    with BagWriter(tmp_path / "two.mcap") as out:
+        for topic, _, message, stamp in read_messages(BAG, {"/camera_info", "/keypoints"}):
+            out.write(topic, message, stamp)
+            if topic == "/camera_info":
+                out.write("/depth/camera_info", replace(message, p=2 * message.p), stamp)
+    with pytest.raises(DataError, match="2 cameras"):
+        load_training_data(tmp_path / "two.mcap", COCO)
 
 
 @pytest.mark.parametrize("length", ["[left_hip, left_hoof, 0.4]", "[nose, nose, 1]", "[nose, left_eye, x]", "5"])

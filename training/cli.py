@@ -11,13 +11,13 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from paul_ros.bag import BagError, check_output
+from paul_ros.bag import BagError, check_outputs
 from paul_ros.files import write_atomically
-from paul_ros.model import ModelError
+from paul_ros.model import ModelError, check_size
 from paul_ros.parameters import DEFAULTS
 from paul_ros.skeleton import LayoutError, load_layout
 from training.data import DataError, load_training_data
-from training.export import export_model
+from training.export import architecture, export_model
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.trainer import CHECKPOINT, LOG, Trainer, TrainingError
 
@@ -64,14 +64,12 @@ def run(args: argparse.Namespace) -> int:
     """Train, or continue, and export. Raises one of ERRORS."""
     if args.output.suffix != ".npz":
         raise DataError(f"the model file must end in .npz, not '{args.output.name}'")
-    for output in filter(None, (args.output, args.json)):
-        if output.resolve() == Path(args.data).resolve():
-            raise DataError(f"'{output}' is the data that is trained on: name another output")
-        check_output(output)
+    folder = args.output.with_suffix(".run")
+    check_outputs([args.output, args.json, folder / CHECKPOINT, folder / LOG], [args.data, args.recipe, args.layout])
     recipe = Recipe.load(args.recipe, args.set)
     data = load_training_data(args.data, load_layout(args.layout), args.topic, args.min_confidence)
     recipe.check_points(data.layout)
-    folder = args.output.with_suffix(".run")
+    check_size(architecture(recipe), len(data.layout.names))
     if args.fresh:
         for name in (CHECKPOINT, LOG):
             (folder / name).unlink(missing_ok=True)

@@ -137,9 +137,7 @@ def _read_bag(
     if camera is None:
         return xy.transpose(0, 2, 1), visible, False
     some = visible.any(1)
-    W = centred_view(xy[some], visible[some], camera).W
-    # A wild detection far from the others is no reason to refuse the bag.
-    return W, visible[some] & (np.abs(W).max(1) < RAY_LIMIT), True
+    return centred_view(xy[some], visible[some], camera).W, visible[some], True
 
 
 def _bag_keypoints(
@@ -150,16 +148,20 @@ def _bag_keypoints(
 
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
     camera, refused = None, ""
+    cameras: set[msg_adapters.Intrinsics] = set()
     for name, type_name, message, _ in read_messages(path):
         try:
             if type_name == "sensor_msgs/msg/CameraInfo":
                 camera = msg_adapters.read_camera_info(message)
+                cameras.add(camera)
             elif type_name in msg_adapters.SUPPORTED and topic in (None, name):
                 seen = msg_adapters.read(type_name, message, len(layout.names))
                 if seen.persons:
                     frames.setdefault(name, []).append(seen)
         except msg_adapters.MessageError as error:
             refused = f"; the last message refused on {name}: {error}"
+    if len(cameras) > 1:
+        raise DataError(f"'{path}' has CameraInfo of {len(cameras)} cameras: keep that of the keypoints only")
     return frames, camera, refused
 
 

@@ -13,6 +13,7 @@ import paul_ros
 from paul_ros.metrics import procrustes
 from paul_ros.model import save_model
 from paul_ros.skeleton import Layout
+from training.recipe import Recipe
 from training.trainer import Trainer, predict_shapes, rule_share
 
 _MEAN_ROUNDS = 10
@@ -29,11 +30,7 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
     layout, recipe = trainer.data.layout, trainer.recipe
     header = {
         "layout": layout.to_dict(),
-        "bottleneck": recipe.bottleneck,
-        "architecture": {
-            "encoder": {"kind": "residual", "width": recipe.width, "blocks": recipe.blocks},
-            "decoder": {"kind": "mlp", "hidden": list(recipe.hidden)},
-        },
+        **architecture(recipe),
         "normalisation": {
             "input": "centred on the mean of the visible points, root mean square distance 1",
             "unit": "mean edge length" if layout.edges else "root mean square distance to the centre",
@@ -58,6 +55,17 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
     }
     save_model(path, header, {**_weights(trainer), "mean_shape": mean_shape(shapes)})
     return header
+
+
+def architecture(recipe: Recipe) -> dict:
+    """The part of the header that says how the networks are built."""
+    return {
+        "bottleneck": recipe.bottleneck,
+        "architecture": {
+            "encoder": {"kind": "residual", "width": recipe.width, "blocks": recipe.blocks},
+            "decoder": {"kind": "mlp", "hidden": list(recipe.hidden)},
+        },
+    }
 
 
 def _weights(trainer: Trainer) -> dict[str, np.ndarray]:

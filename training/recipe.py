@@ -86,7 +86,7 @@ class Recipe:
         for length in self.known_lengths:
             a, b, metres = length if isinstance(length, tuple) and len(length) == 3 else (None, None, None)
             between = a in layout.names and b in layout.names and a != b
-            if not between or type(metres) not in (int, float) or not 0 < metres < 1e3:
+            if not between or type(metres) not in (int, float) or not 1e-3 <= metres < 1e3:
                 raise RecipeError(
                     f"known_lengths must be [point, point, metres] with two points of layout '{layout.name}', "
                     f"one is {length!r}"
