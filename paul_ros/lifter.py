@@ -36,7 +36,7 @@ class Lifted:
         root: (N,3) the layout's root point, same frame and units.
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
-        reprojection: (N,) pixels, root mean square over the visible points.
+        reprojection: (N,) pixels, root mean square over the visible points (those within 60 degrees of the person).
         ambiguity: (N,) 0..1, residual of the pose over that of its mirrored rival; 1 means undecidable.
         certified: (N,) the pose is the proven optimum of orthographic-N-point.
         reason: N slugs, '' where lifted, else why not: ``too_few_points``, fewer visible than the model asks for;

@@ -24,7 +24,7 @@ class CentredView:
 
     Attributes:
         W: (N,2,P) normalised image points (unit focal length) in the virtual cameras; NaN where hidden, or farther than
-            60 degrees from the person's direction, where no point of a person in front of a camera is.
+            60 degrees from the person's direction: taken for a misdetection.
         turn: (N,3,3) rotations from the virtual cameras to the real one.
     """
 

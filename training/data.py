@@ -143,17 +143,16 @@ def _read_bag(
 def _bag_keypoints(
     path: Path, layout: Layout, topic: str | None
 ) -> tuple[dict[str, list[msg_adapters.Keypoints2D]], msg_adapters.Intrinsics | None, str]:
-    """Keypoint messages by topic, the last usable camera, and why the last refused message was."""
+    """Keypoint messages by topic, the camera, and why the last refused message was."""
     from paul_ros.bag import read_messages  # needs the extra "bags"
 
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
-    camera, refused = None, ""
+    refused = ""
     cameras: set[msg_adapters.Intrinsics] = set()
     for name, type_name, message, _ in read_messages(path):
         try:
             if type_name == "sensor_msgs/msg/CameraInfo":
-                camera = msg_adapters.read_camera_info(message)
-                cameras.add(camera)
+                cameras.add(msg_adapters.read_camera_info(message))
             elif type_name in msg_adapters.SUPPORTED and topic in (None, name):
                 seen = msg_adapters.read(type_name, message, len(layout.names))
                 if seen.persons:
@@ -162,7 +161,7 @@ def _bag_keypoints(
             refused = f"; the last message refused on {name}: {error}"
     if len(cameras) > 1:
         raise DataError(f"'{path}' has CameraInfo of {len(cameras)} cameras: keep that of the keypoints only")
-    return frames, camera, refused
+    return frames, cameras.pop() if cameras else None, refused
 
 
 def _checked(W: np.ndarray, visible: np.ndarray, layout: Layout, calibrated: bool, path: Path) -> TrainingData:
