@@ -96,14 +96,15 @@ def onp(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None = None, scale: 
     )
 
 
-def _checked(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _checked(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> tuple:
     S, W = np.asarray(S, float), np.asarray(W, float)
     if S.ndim != 3 or S.shape[1] != 3 or W.shape != (S.shape[0], 2, S.shape[2]):
         raise ValueError(f"onp needs S (N,3,P) and W (N,2,P), got {S.shape} and {W.shape}")
-    w = np.ones((S.shape[0], S.shape[2])) if weights is None else np.asarray(weights, float)
-    if w.shape != (S.shape[0], S.shape[2]):
-        raise ValueError(f"onp needs weights (N,P) = {(S.shape[0], S.shape[2])}, got {w.shape}")
-    return S, W, w
+    if weights is not None:
+        weights = np.asarray(weights, float)
+        if weights.shape != (S.shape[0], S.shape[2]):
+            raise ValueError(f"onp needs weights (N,P) = {(S.shape[0], S.shape[2])}, got {weights.shape}")
+    return S, W, weights
 
 
 class _Points(NamedTuple):
@@ -118,18 +119,19 @@ class _Points(NamedTuple):
     moments: np.ndarray  # (N,5,5)
 
     @classmethod
-    def of(cls, S: np.ndarray, W: np.ndarray, w: np.ndarray) -> _Points:
-        X, least = np.concatenate([S, W], axis=1), w.min(1, initial=1.0)
-        enough = np.full(len(w), w.shape[1] >= MIN_POINTS)
-        if not (least > 0).all():
-            X, enough = np.where((w != 0)[:, None], X, 0.0), (w > 0).sum(1) >= MIN_POINTS
+    def of(cls, S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> _Points:
+        X = np.concatenate([S, W], axis=1)
+        N, _, P = X.shape
+        w, sound = (np.full((N, P), 1.0 / max(P, 1)), P >= MIN_POINTS) if weights is None else _normalised(weights)
+        if weights is not None and not (w > 0).all():
+            X = np.where((w != 0)[:, None], X, 0.0)
         with np.errstate(all="ignore"):  # what overflows or is no number is found by its trace
-            w = w / w.sum(1, keepdims=True)
             mean = (X @ w[..., None])[..., 0]
             X = X - mean[..., None]
             moments = (X * w[:, None]) @ X.transpose(0, 2, 1)
-            sound = enough & (least >= 0) & (moments.trace(axis1=1, axis2=2) < _LARGEST**2)
+            sound &= moments.trace(axis1=1, axis2=2) < _LARGEST**2
         if not sound.all():
+            w = w.copy()
             for part in (X, w, mean, moments):
                 part[~sound] = 0.0
         return cls(X, w, mean, moments)
@@ -140,3 +142,10 @@ class _Points(NamedTuple):
         error = (camera.reshape(N, 4, 3) @ self.X[:, :3]).reshape(N, 2, 2, P) - self.X[:, None, 3:]
         square = (error * error).reshape(N, 4, P) @ self.w[..., None]
         return np.sqrt(square[:, ::2, 0] + square[:, 1::2, 0])
+
+
+def _normalised(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of sum 1, and (N,) whether they are sound: none negative, enough of them positive."""
+    sound = (weights.min(1, initial=0.0) >= 0) & ((weights > 0).sum(1) >= MIN_POINTS)
+    with np.errstate(all="ignore"):
+        return weights / weights.sum(1, keepdims=True), sound

@@ -67,22 +67,23 @@ class Poses(NamedTuple):
     determined: np.ndarray
 
 
-def solve(moments: np.ndarray, mean: np.ndarray, scale: Scale) -> Poses:
+def solve(moments: np.ndarray, mean: np.ndarray, scale: Scale, rivals: bool = True) -> Poses:
     """Best poses of N problems.
 
     Args:
         moments: (N,5,5) finite weighted second moments of (shape x, y, z, image x, y) about
         mean: (N,5) their weighted means.
         scale: which of the two goals.
+        rivals: whether to look for second optima, half of the work; without, the best stands in for its rival.
     """
-    N = len(moments)
+    N, method = len(moments), _solve if rivals else _solve_alone
     a, axes = np.linalg.eigh(moments[:, :3, :3])
     inputs = (moments.reshape(N, 25), mean, a, axes.reshape(N, 9))
     if N <= _FEW:
-        answers = [_answer(_Floats, *row, scale) for row in zip(*(part.tolist() for part in inputs))]
+        answers = [_answer(_Floats, *row, scale, method) for row in zip(*(part.tolist() for part in inputs))]
         table = np.array(answers, dtype=float).reshape(N, 27)
     else:
-        table = np.stack(_answer(_Arrays, *(list(part.T.copy()) for part in inputs), scale), axis=1)
+        table = np.stack(_answer(_Arrays, *(list(part.T.copy()) for part in inputs), scale, method), axis=1)
     poses = table[:, :24].reshape(N, 2, 12)
     flags = table[:, 24:].T > 0
     return Poses(poses[:, :, :9].reshape(N, 2, 3, 3), poses[:, :, 9], poses[:, :, 10:], *flags)
@@ -106,8 +107,8 @@ class _Floats:
         return [_Floats.climb(problem, n, scale) for n in starts]
 
     @staticmethod
-    def search(problem: Problem, found: Solution, scale: Scale) -> Solution:
-        return _search(_Floats, problem, found, scale)
+    def retry(method: Callable, problem: Problem, found: Solution, scale: Scale) -> Solution:
+        return method(_Floats, problem, found, scale)
 
 
 class _Arrays:
@@ -135,9 +136,10 @@ class _Arrays:
         return [_take(views, slice(i * N, (i + 1) * N)) for i in range(len(starts))]
 
     @staticmethod
-    def search(problem: Problem, found: Solution, scale: Scale) -> Solution:
+    def retry(method: Callable, problem: Problem, found: Solution, scale: Scale) -> Solution:
+        """Another method where there is no proof."""
         hard = ~found.certified
-        _put(found, hard, _search(_Arrays, _take(problem, hard), _take(found, hard), scale))
+        _put(found, hard, method(_Arrays, _take(problem, hard), _take(found, hard), scale))
         return found
 
 
@@ -205,7 +207,13 @@ _HARMLESS = Problem((0.2, 0.3, 0.5), (0.3 + 0j, 0.4j, 0.1 + 0.1j), (0.04, -0.03,
 
 
 def _answer(
-    xp: Kind, M: Sequence[Number], mean: Sequence[Number], a: Vector, V: Sequence[Number], scale: Scale
+    xp: Kind,
+    M: Sequence[Number],
+    mean: Sequence[Number],
+    a: Vector,
+    V: Sequence[Number],
+    scale: Scale,
+    method: Callable,
 ) -> list[Number]:
     """Best and rival as ``_pose`` gives them, then three flags; from 25 moments, 5 means, and the shape's axes."""
     S_square, W_square = M[0] + M[6] + M[12], M[18] + M[24]
@@ -225,8 +233,8 @@ def _answer(
         & (_square(d[0]) + _square(d[1]) + _square(d[2]) > _ROUNDING**2)
     )
     if xp.every(determined):
-        return _poses(xp, _solve(xp, problem, scale), axes, mean, zoom, scale, determined)
-    found = _solve(xp, xp.where(determined, problem, _HARMLESS), scale)
+        return _poses(xp, method(xp, problem, scale), axes, mean, zoom, scale, determined)
+    found = method(xp, xp.where(determined, problem, _HARMLESS), scale)
     answer = _poses(xp, found, axes, mean, zoom, scale, determined)
     nothing = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     nothing += [1.0, mean[3] - mean[0], mean[4] - mean[1]] if scale == "unit" else [0.0, mean[3], mean[4]]
@@ -376,12 +384,17 @@ def _climb(xp: Kind, problem: Problem, n: Vector, scale: Scale, steps: int, know
 
 
 def _start(xp: Kind, problem: Problem) -> Vector:
-    """Least squares along the two thick axes; along the thin one, where it is all noise, what makes a rotation of it.
+    """Least squares along the two thick axes; along the thin one, the thinner the more, what makes a rotation of it.
 
-    q = s (r1 + i r2) has q^T q = 0, which leaves two roots for q_0: Necker reversals of each other.
+    q = s (r1 + i r2) has q^T q = 0, which leaves two roots for q_0, Necker reversals of each other; least squares,
+    d_0 / a_0, is all noise where a_0 is small, and tells no more than which.
     """
-    q1, q2 = problem.d[1] / problem.a[1], problem.d[2] / problem.a[2]
-    return _unit(xp, _cross_of_parts((xp.complex_sqrt(-(q1 * q1 + q2 * q2)), q1, q2)))
+    (a0, a1, a2), (d0, d1, d2) = problem.a, problem.d
+    q1, q2 = d1 / a1, d2 / a2
+    root = xp.complex_sqrt(-(q1 * q1 + q2 * q2))
+    weight = 1 - a0 / a1
+    q0 = d0 / a1 + xp.where((root * d0.conjugate()).real < 0, -weight, weight) * root
+    return _unit(xp, _cross_of_parts((q0, q1, q2)))
 
 
 def _solve(xp: Kind, problem: Problem, scale: Scale) -> Solution:
@@ -391,7 +404,18 @@ def _solve(xp: Kind, problem: Problem, scale: Scale) -> Solution:
     two = xp.climb(problem, _reversal(n), scale, one.n)
     swap = (two.g > one.g) & _apart(two.n, one.n)
     found = _with_rival(xp, problem, xp.where(swap, two, one), xp.where(swap, one, two), scale)
-    return found if xp.every(found.certified) else xp.search(problem, found, scale)
+    return found if xp.every(found.certified) else xp.retry(_search, problem, found, scale)
+
+
+def _solve_alone(xp: Kind, problem: Problem, scale: Scale) -> Solution:
+    """The best without a rival: one climb, and all the rest only where that ends without a proof."""
+    one = xp.climb(problem, _start(xp, problem), scale)
+    found = Solution(one, one, _certified(xp, problem, one, scale), one.g < 0)
+    return found if xp.every(found.certified) else xp.retry(_solve_again, problem, found, scale)
+
+
+def _solve_again(xp: Kind, problem: Problem, found: Solution, scale: Scale) -> Solution:
+    return _solve(xp, problem, scale)
 
 
 def _with_rival(xp: Kind, problem: Problem, best: View, other: View, scale: Scale) -> Solution:
