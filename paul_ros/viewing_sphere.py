@@ -124,8 +124,7 @@ class _Arrays:
     def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None) -> View:
         view = _climb(_Arrays, problem, n, scale, _USUAL_STEPS, known)
         late = ~_stationary(view) if known is None else ~_stationary(view) & _apart(view.n, known)
-        if late.any():
-            _put(view, late, _climb(_Arrays, _take(problem, late), _take(view.n, late), scale, _STEPS))
+        _redo(view, late, lambda xp, *rest: _climb(xp, *rest, scale, _STEPS), problem, view.n)
         return view
 
     @staticmethod
@@ -138,8 +137,7 @@ class _Arrays:
     @staticmethod
     def retry(method: Callable, problem: Problem, found: Solution, scale: Scale) -> Solution:
         """Another method where there is no proof."""
-        hard = ~found.certified
-        _put(found, hard, method(_Arrays, _take(problem, hard), _take(found, hard), scale))
+        _redo(found, ~found.certified, lambda xp, *rest: method(xp, *rest, scale), problem, found)
         return found
 
 
@@ -158,8 +156,14 @@ def _take(tree: Any, rows: Any) -> Any:
     return _map(lambda values: values[rows], tree)
 
 
-def _put(tree: Any, rows: np.ndarray, new: Any) -> None:
-    _map(lambda values, value: values.__setitem__(rows, value), tree, new)
+def _redo(tree: Any, rows: np.ndarray, method: Callable, *inputs: Any) -> None:
+    """Overwrite some rows of a tree with what a method makes of those rows of its inputs; few of them one by one."""
+    if np.count_nonzero(rows) > _FEW:
+        _map(lambda values, new: values.__setitem__(rows, new), tree, method(_Arrays, *_take(inputs, rows)))
+        return
+    for row in np.flatnonzero(rows):
+        new = method(_Floats, *_map(lambda values: values[row].item(), inputs))
+        _map(lambda values, value: values.__setitem__(row, value), tree, new)
 
 
 # --- from moments to a problem, and from a solution to poses
@@ -223,7 +227,7 @@ def _answer(
     axes = (_cross(v1, v2), v1, v2)
     b = ((M[15] + 1j * M[20]) * over_both, (M[16] + 1j * M[21]) * over_both, (M[17] + 1j * M[22]) * over_both)
     d = (_dot(b, axes[0]), _dot(b, v1), _dot(b, v2))
-    zoom = xp.sqrt(W_square * over_S)
+    zoom = xp.sqrt(W_square) * xp.sqrt(over_S)
     problem = Problem((a[0] * over_S, a[1] * over_S, a[2] * over_S), d, _cross_of_parts(d), 1 / (1 + zoom))
     # Where the second eigenvalue vanishes all points lie on one line, and turns about that line show nowhere.
     determined = (
@@ -233,17 +237,18 @@ def _answer(
         & (_square(d[0]) + _square(d[1]) + _square(d[2]) > _ROUNDING**2)
     )
     if xp.every(determined):
-        return _poses(xp, method(xp, problem, scale), axes, mean, zoom, scale, determined)
+        return [*_poses(xp, method(xp, problem, scale), axes, mean, zoom, scale), determined]
     found = method(xp, xp.where(determined, problem, _HARMLESS), scale)
-    answer = _poses(xp, found, axes, mean, zoom, scale, determined)
+    answer = [*_poses(xp, found, axes, mean, zoom, scale), determined]
     nothing = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     nothing += [1.0, mean[3] - mean[0], mean[4] - mean[1]] if scale == "unit" else [0.0, mean[3], mean[4]]
     return [xp.where(determined, x, y) for x, y in zip(answer, 2 * nothing + 3 * [False])]
 
 
-def _poses(xp, found: Solution, axes, mean, zoom, scale: Scale, determined: Number) -> list[Number]:
-    best, rival = (_pose(xp, view, axes, mean, zoom, scale) for view in (found.best, found.rival))
-    return [*best, *rival, found.certified, found.two_fold, determined]
+def _poses(xp: Kind, found: Solution, *rest: Any) -> list[Number]:
+    best = _pose(xp, found.best, *rest)
+    rival = best if found.rival is found.best else _pose(xp, found.rival, *rest)
+    return [*best, *rival, found.certified, found.two_fold]
 
 
 def _pose(
@@ -339,7 +344,8 @@ def _view(xp: Kind, problem: Problem, n: Vector, scale: Scale) -> View:
 
 def _facing(xp: Kind, problem: Problem, n: Vector) -> Vector:
     """n or -n, whichever has the larger T: the two see the same plane from its two sides."""
-    return xp.where(_dot(problem.c, n) < 0, (-n[0], -n[1], -n[2]), n)
+    sign = xp.where(_dot(problem.c, n) < 0, -1.0, 1.0)
+    return (sign * n[0], sign * n[1], sign * n[2])
 
 
 def _reversal(n: Vector) -> Vector:
