@@ -421,7 +421,8 @@ def _solve_alone(xp: Kind, problem: Problem, scale: Scale) -> Solution:
 
 
 def _solve_again(xp: Kind, problem: Problem, found: Solution, scale: Scale) -> Solution:
-    return _solve(xp, problem, scale)
+    whole = _solve(xp, problem, scale)
+    return whole._replace(rival=whole.best)
 
 
 def _with_rival(xp: Kind, problem: Problem, best: View, other: View, scale: Scale) -> Solution:

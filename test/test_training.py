@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records
 from paul_ros.model import ModelError, load_model
-from paul_ros.onp import onp
 from paul_ros.replay import open_stream, replay
 from paul_ros.skeleton import load_layout
 from training import cli, human_data
@@ -25,7 +24,7 @@ from training.mocap import CMU31
 from training.networks import Paul
 from training.objective import Views, bone_variation, handedness_violation, paul_terms, undo_perspective
 from training.recipe import Recipe, RecipeError, recipe_names
-from training.solver import centre, solve_camera
+from training.solver import centre
 from training.trainer import Trainer, TrainingError
 
 COCO = load_layout("coco17")
@@ -71,50 +70,6 @@ def train(*arguments):
     parser = argparse.ArgumentParser()
     cli.add_arguments(parser)
     return cli.run(parser.parse_args([str(argument) for argument in arguments]))
-
-
-def problem(count=6, points=12, noise=0.0, seed=0):
-    rng = np.random.default_rng(seed)
-    S = torch.from_numpy(rng.standard_normal((count, 3, points)))
-    R = torch.from_numpy(Rotation.random(count, random_state=seed).as_matrix())
-    visible = torch.from_numpy(rng.permuted(np.tile(np.arange(points) < points - 2, (count, 1)), axis=1))
-    W = 1.7 * R[:, :2] @ S + noise * torch.from_numpy(rng.standard_normal((count, 2, points)))
-    return S, R, centre(W, visible), visible
-
-
-def test_solver_finds_the_camera_of_exact_views():
-    S, R, W, visible = problem()
-    found, scale = solve_camera(S, W, visible)
-    torch.testing.assert_close(found, R, atol=1e-6, rtol=0)
-    torch.testing.assert_close(scale.flatten(), torch.full((6,), 1.7, dtype=torch.double), rtol=1e-6, atol=0)
-    torch.testing.assert_close(torch.linalg.det(found), torch.ones(6, dtype=torch.double))
-
-
-def test_solver_ignores_hidden_points():
-    S, _, W, visible = problem(noise=0.1)
-    broken = torch.where(visible[:, None], W, 1e3)
-    torch.testing.assert_close(solve_camera(S, W, visible), solve_camera(S, broken, visible))
-
-
-def test_solver_reaches_the_certified_optimum():
-    S, _, W, visible = problem(count=200, noise=0.2)
-    _, scale = solve_camera(S, W, visible)
-    optimum = onp(S.numpy(), W.numpy(), visible.numpy())
-    agrees = np.isclose(scale.flatten().numpy(), optimum.scale, rtol=1e-5)
-    assert agrees.mean() > 0.95  # the rest: another local optimum
-
-
-def test_solver_gradient_against_finite_differences():
-    S, _, W, visible = problem(count=2, noise=0.2)
-    assert torch.autograd.gradcheck(lambda s: solve_camera(s, W, visible), S.clone().requires_grad_(), atol=1e-6)
-
-
-def test_solver_gradient_is_finite_for_flat_shapes():
-    S, _, W, visible = problem()
-    S = (S * torch.tensor([1.0, 1.0, 0.0])[:, None]).requires_grad_()
-    R, scale = solve_camera(S, W, visible)
-    (R.sum() + scale.sum()).backward()
-    assert torch.isfinite(S.grad).all()
 
 
 def batch(image, visible, calibrated=False):
