@@ -30,12 +30,15 @@ class OnP(NamedTuple):
         scale: (N,) image units per shape unit (1 in the unit-scale problem).
         translation: (N,2) image units.
         residual: (N,) weighted root mean square distance to W, image units.
-        certified: (N,) bool, the pose is proven to be the global optimum: no other has a weighted mean of squared
-            distances smaller by more than 1e-10 of the image points' own mean square about their mean.
+        certified: (N,) bool, the pose is proven to be the global optimum: no other has a mean of squared distances
+            smaller by more than 1e-10 of the image's mean square about its mean (in the unit-scale problem, of the
+            image's and the shape's together; in the free-scale problem of shapes whose second axis is r times as long
+            as the first, by more than 1e-10 / r^2).
         determined: (N,) bool, False where the points fix no pose: fewer than ``MIN_POINTS``, all on one line, an image
-            without extent or without correlation to the shape, or a point that is not finite (or beyond 1e150). R is
-            then the identity and scale 0 (1 in the unit-scale problem).
-        two_fold: (N,) bool, the problem has a second optimum, the depth reversed.
+            without correlation to the shape, shape or image without extent (less than 1e-12 of its distance from the
+            origin, or 1e-70) or beyond 1e150, a coordinate or weight that is no number, a negative weight. R is then
+            the identity and scale 0 (1 in the unit-scale problem).
+        two_fold: (N,) bool, the problem has a second optimum more than three degrees away, the depth reversed.
         R_mirror, scale_mirror, translation_mirror, residual_mirror: that second optimum; where there is none, the
             Necker reversal of the first (reflected about the axis along which the shape is thinnest).
     """
@@ -121,31 +124,44 @@ class _Points(NamedTuple):
     @classmethod
     def of(cls, S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> _Points:
         X = np.concatenate([S, W], axis=1)
-        N, _, P = X.shape
-        w, sound = (np.full((N, P), 1.0 / max(P, 1)), P >= MIN_POINTS) if weights is None else _normalised(weights)
-        if weights is not None and not (w > 0).all():
-            X = np.where((w != 0)[:, None], X, 0.0)
-        with np.errstate(all="ignore"):  # what overflows or is no number is found by its trace
-            mean = (X @ w[..., None])[..., 0]
-            X = X - mean[..., None]
-            moments = (X * w[:, None]) @ X.transpose(0, 2, 1)
-            sound &= moments.trace(axis1=1, axis2=2) < _LARGEST**2
+        with np.errstate(all="ignore"):  # what overflows or is no number shows in the moments
+            w, enough = _normalised(weights, X.shape)
+            points = cls._about_mean(X, w)
+            sound = points._finite()
+            if weights is not None and not sound.all():  # perhaps only because of points that have no weight
+                points = cls._about_mean(np.where((w != 0)[:, None], X, 0.0), w)
+                sound = points._finite()
+            sound = sound & enough
         if not sound.all():
-            w = w.copy()
-            for part in (X, w, mean, moments):
+            points = points._replace(w=w.copy())
+            for part in points:
                 part[~sound] = 0.0
-        return cls(X, w, mean, moments)
+        return points
+
+    @classmethod
+    def _about_mean(cls, X: np.ndarray, w: np.ndarray) -> _Points:
+        mean = (X @ w[..., None])[..., 0]
+        X = X - mean[..., None]
+        return cls(X, w, mean, (X * w[:, None]) @ X.transpose(0, 2, 1))
+
+    def _finite(self) -> np.ndarray:
+        return self.moments.trace(axis1=1, axis2=2) < _LARGEST**2
 
     def residuals(self, camera: np.ndarray) -> np.ndarray:
         """(N,2) weighted root mean square distances under two cameras (N,2,2,3) a problem."""
         N, P = self.w.shape
-        error = (camera.reshape(N, 4, 3) @ self.X[:, :3]).reshape(N, 2, 2, P) - self.X[:, None, 3:]
-        square = (error * error).reshape(N, 4, P) @ self.w[..., None]
+        with np.errstate(all="ignore"):
+            error = (camera.reshape(N, 4, 3) @ self.X[:, :3]).reshape(N, 2, 2, P) - self.X[:, None, 3:]
+            square = (error * error).reshape(N, 4, P) @ self.w[..., None]
+        if not np.isfinite(square).all():  # by points of no weight and absurd size
+            return self._replace(X=np.where((self.w > 0)[:, None], self.X, 0.0)).residuals(camera)
         return np.sqrt(square[:, ::2, 0] + square[:, 1::2, 0])
 
 
-def _normalised(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of sum 1, and (N,) whether they are sound: none negative, enough of them positive."""
+def _normalised(weights: np.ndarray | None, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray | bool]:
+    """Weights (N,P) of sum 1, and whether (N,) they are sound: none negative, enough of them positive."""
+    if weights is None:
+        N, _, P = shape
+        return np.full((N, P), 1.0 / max(P, 1)), P >= MIN_POINTS
     sound = (weights.min(1, initial=0.0) >= 0) & ((weights > 0).sum(1) >= MIN_POINTS)
-    with np.errstate(all="ignore"):
-        return weights / weights.sum(1, keepdims=True), sound
+    return weights / weights.sum(1, keepdims=True), sound

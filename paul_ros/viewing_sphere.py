@@ -38,11 +38,11 @@ _COLLINEAR = 1e-10  # of the shape's squared size: less beside the longest axis 
 _ROUNDING = 1e-12  # of a distance from the origin, or of the sizes that a correlation is of: less is none
 _STEPS = 40
 _USUAL_STEPS = 6  # array rows that need more go on without the others
-_STEP_LIMIT = 0.5  # radians: keeps Newton inside the basin it started in
-_STATIONARY = 1e-10  # slope over g of a direction that has arrived
+_STEP_LIMIT = 0.8  # radians: keeps Newton in sight of the hill it started on
+_GAIN = 1e-22  # of g, what another step from a direction that has arrived could gain
 _SLACK = 1e-11  # of g, what a proof may miss
-_COS_APART = math.cos(0.02)  # radians: two directions closer than this are one
-_SEARCH_CLIMBS = 24
+_COS_APART = math.cos(0.05)  # radians: two directions closer than this are one
+_SEARCH_CLIMBS = 12
 _LEAST = 1e-140  # squared size of points that have any
 _TINY = 1e-150
 
@@ -83,7 +83,8 @@ def solve(moments: np.ndarray, mean: np.ndarray, scale: Scale, rivals: bool = Tr
         answers = [_answer(_Floats, *row, scale, method) for row in zip(*(part.tolist() for part in inputs))]
         table = np.array(answers, dtype=float).reshape(N, 27)
     else:
-        table = np.stack(_answer(_Arrays, *(list(part.T.copy()) for part in inputs), scale, method), axis=1)
+        with np.errstate(over="ignore"):  # of means beyond all reason, which fix no pose
+            table = np.stack(_answer(_Arrays, *(list(part.T.copy()) for part in inputs), scale, method), axis=1)
     poses = table[:, :24].reshape(N, 2, 12)
     flags = table[:, 24:].T > 0
     return Poses(poses[:, :, :9].reshape(N, 2, 3, 3), poses[:, :, 9], poses[:, :, 10:], *flags)
@@ -92,7 +93,7 @@ def solve(moments: np.ndarray, mean: np.ndarray, scale: Scale, rivals: bool = Tr
 class _Floats:
     """What floats and arrays do not write alike, for floats."""
 
-    sqrt, complex_sqrt, minimum, maximum, every = math.sqrt, cmath.sqrt, min, max, bool
+    sqrt, complex_sqrt, minimum, every, any = math.sqrt, cmath.sqrt, min, bool, bool
 
     @staticmethod
     def where(condition: bool, yes: Any, no: Any) -> Any:
@@ -114,7 +115,7 @@ class _Floats:
 class _Arrays:
     """The same for arrays; ``where`` works through trees of tuples."""
 
-    sqrt, complex_sqrt, minimum, maximum, every = np.sqrt, np.sqrt, np.minimum, np.maximum, np.all
+    sqrt, complex_sqrt, minimum, every, any = np.sqrt, np.sqrt, np.minimum, np.all, np.any
 
     @staticmethod
     def where(condition: np.ndarray, yes: Any, no: Any) -> Any:
@@ -123,7 +124,7 @@ class _Arrays:
     @staticmethod
     def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None) -> View:
         view = _climb(_Arrays, problem, n, scale, _USUAL_STEPS, known)
-        late = ~_stationary(view) if known is None else ~_stationary(view) & _apart(view.n, known)
+        late = ~_arrived(problem, view) if known is None else ~_arrived(problem, view) & _apart(view.n, known)
         _redo(view, late, lambda xp, *rest: _climb(xp, *rest, scale, _STEPS), problem, view.n)
         return view
 
@@ -348,13 +349,22 @@ def _facing(xp: Kind, problem: Problem, n: Vector) -> Vector:
     return (sign * n[0], sign * n[1], sign * n[2])
 
 
+def _opposite(n: Vector) -> Vector:
+    return (-n[0], -n[1], -n[2])
+
+
 def _reversal(n: Vector) -> Vector:
     """The Necker reversal of n: reflected about the axis along which the shape is thinnest."""
     return (n[0], -n[1], -n[2])
 
 
 def _stationary(view: View) -> Number:
-    return _square(view.slope) <= (_STATIONARY * view.g) ** 2
+    """Another step would gain nothing: its gain is about slope^2 over curvature, which is huge for needles end on."""
+    return _square(view.slope) <= _GAIN * view.g * (view.g + abs(view.m))
+
+
+def _arrived(problem: Problem, view: View) -> Number:
+    return _stationary(view) & (_dot(problem.c, view.n) >= 0)
 
 
 def _is_optimum(view: View) -> Number:
@@ -377,14 +387,22 @@ def _moved(xp: Kind, view: View, step: Number) -> Vector:
 
 
 def _climb(xp: Kind, problem: Problem, n: Vector, scale: Scale, steps: int, known: Vector | None = None) -> View:
-    """The local maximum near n, or how far so many Newton steps came; less far where they come to a known maximum."""
-    view, limit = _view(xp, problem, _facing(xp, problem, n), scale), _STEP_LIMIT
+    """The local maximum near n, or how far so many Newton steps came; less far where they come to a known maximum.
+
+    Not n's facing side first: that would take some climbs off the hill of the second optimum. But a maximum where the
+    other side has a larger T is none to stay on.
+    """
+    view, limit = _view(xp, problem, n, scale), _STEP_LIMIT
     for _ in range(steps):
-        done = _stationary(view)
-        if xp.every(done if known is None else done | (_dot(view.n, known) >= _COS_APART)):
+        still, facing = _stationary(view), _dot(problem.c, view.n) >= 0
+        done = still & facing if known is None else still & facing | (_dot(view.n, known) >= _COS_APART)
+        if xp.every(done):
             break
         step, before = _newton_step(xp, view, limit), view.g
-        view = _view(xp, problem, _facing(xp, problem, _moved(xp, view, step)), scale)
+        n = _moved(xp, view, step)
+        if xp.any(still):
+            n = xp.where(still > facing, _opposite(view.n), n)
+        view = _view(xp, problem, n, scale)
         limit = xp.where(view.g < before, 0.3 * limit, limit)  # or steps too long could go in circles
     return view
 
