@@ -141,6 +141,86 @@ def _demo(args: argparse.Namespace) -> None:
     demo(args.out, args.model)
 
 
+_ONP_COLUMNS = """\
+columns, a line for each scenario and method:
+  cases     problems solved; lm_search, which is slow, solves only the first 200 of a scenario
+  cert. %   share that is proven to be the global optimum (ours only)
+  wrong     of these, how many the naive search beats: must be 0
+  missed    how many leave more than the best known residual
+  better    how many leave less than ours
+  angle     degrees to the optimum, median; then the 95th percentile
+  ratio     residual over that of the optimum, median; then the largest
+  µs        of one pose, called alone: best of several calls, median of several problems
+  µs batch  a pose, in one call with --batch of them
+  x lsq     the time before it over that of lsq_svd
+"More" and "less" are by 1e-9 of the image's mean square, in means of squared distances. Noise is the standard
+deviation of each image coordinate, over the shape's rms radius / sqrt(3), both in the image's unit.
+
+methods:
+  ours       paul_ros.onp
+  lsq_svd    least squares, then SVD (Wang and Lucey, CVPR 2021)
+  polar      viewing direction of the affine fit, then Procrustes (polar factor) in its plane
+  majorise   200 steps of majorisation (Kiers; ten Berge) from lsq_svd
+  lm_search  Levenberg-Marquardt from 8 spread rotations
+"""
+
+
+def _add_benchmark(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "benchmark", help="measure this package against others", description="Measure this package against others."
+    )
+    subjects = parser.add_subparsers(metavar="SUBJECT", required=True)
+    _add_benchmark_onp(subjects)
+
+
+def _add_benchmark_onp(subjects: argparse._SubParsersAction) -> None:
+    parser = subjects.add_parser(
+        "onp",
+        help="orthographic-N-point: optimality, residuals and times of five solvers",
+        description="Solve random orthographic-N-point problems by five methods and compare them with the optimum that "
+        "a naive search finds. One thread. Then the 3D error where the shape is known up to 20 % noise.",
+        epilog=_ONP_COLUMNS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--cases", metavar="N", type=_positive, default=4400, help="problems a scenario (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--batch", metavar="N", type=_positive, default=10_000, help="poses in one call (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the random problems (default: %(default)s)")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write all rows as JSON")
+    parser.add_argument("--plot", metavar="FILE.png", type=Path, help="draw angles, residuals, times and 3D errors")
+    parser.set_defaults(run=_benchmark_onp)
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is less than 1")
+    return number
+
+
+def _benchmark_onp(args: argparse.Namespace) -> None:
+    from paul_ros.bag import check_outputs
+    from paul_ros.benchmarks import need
+    from paul_ros.report import write_json
+
+    need("scipy", "tqdm", *(["matplotlib"] if args.plot else []))
+    from paul_ros.benchmarks.onp import run
+    from paul_ros.benchmarks.onp_report import table, write_picture
+
+    check_outputs([args.json, args.plot], [])
+    report = run(args.cases, args.batch, args.seed)
+    if args.json:
+        write_json(args.json, report)
+    try:
+        if args.plot:
+            write_picture(args.plot, report)
+    finally:
+        print(table(report))
+
+
 def _add_train(commands: argparse._SubParsersAction, wanted: bool) -> None:
     parser = commands.add_parser(
         "train",
@@ -169,6 +249,7 @@ def _parser(train: bool) -> argparse.ArgumentParser:
     _add_inspect(commands)
     _add_train(commands, train)
     _add_demo(commands)
+    _add_benchmark(commands)
     return parser
 
 

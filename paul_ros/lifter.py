@@ -17,7 +17,7 @@ DEGENERATE_POINTS = "degenerate_points"
 TOO_FAR = "too_far"
 
 AMBIGUOUS = 0.9
-"""From this ambiguity on the mirrored pose explains the image nearly as well."""
+"""From this ambiguity on the depth-reversed pose explains the image nearly as well."""
 
 MIN_EXTENT = 1.0
 """Pixels, root mean square distance of the visible points from their mean: below it an image says nothing of a pose."""
@@ -37,7 +37,8 @@ class Lifted:
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
         reprojection: (N,) pixels, root mean square over the visible points (those within 60 degrees of the person).
-        ambiguity: (N,) 0..1, residual of the pose over that of its mirrored rival; 1 means undecidable.
+        ambiguity: (N,) 0..1, residual of the pose over that of its depth-reversed rival, the second optimum; 0 where
+            there is none, 1 where the image cannot tell them apart.
         certified: (N,) the pose is the proven optimum of orthographic-N-point.
         reason: N slugs, '' where lifted, else why not: ``too_few_points``, fewer visible than the model asks for;
             ``degenerate_points``, they fix no pose: all on one line or, with intrinsics, an rms extent below

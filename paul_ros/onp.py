@@ -124,44 +124,27 @@ class _Points(NamedTuple):
     @classmethod
     def of(cls, S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> _Points:
         X = np.concatenate([S, W], axis=1)
+        N, _, P = X.shape
         with np.errstate(all="ignore"):  # what overflows or is no number shows in the moments
-            w, enough = _normalised(weights, X.shape)
-            points = cls._about_mean(X, w)
-            sound = points._finite()
-            if weights is not None and not sound.all():  # perhaps only because of points that have no weight
-                points = cls._about_mean(np.where((w != 0)[:, None], X, 0.0), w)
-                sound = points._finite()
-            sound = sound & enough
+            if weights is None:
+                w, sound = np.full((N, P), 1.0 / max(P, 1)), np.full(N, P >= MIN_POINTS)
+            else:
+                hidden = weights == 0
+                np.copyto(X, 0.0, where=hidden[:, None])
+                sound = (hidden.sum(1) <= P - MIN_POINTS) & (weights.min(1, initial=0.0) >= 0)
+                w = weights / weights.sum(1, keepdims=True)
+            mean = (X @ w[..., None])[..., 0]
+            X -= mean[..., None]
+            moments = (X * w[:, None]) @ X.transpose(0, 2, 1)
+            sound &= moments.trace(axis1=1, axis2=2) < _LARGEST**2
         if not sound.all():
-            points = points._replace(w=w.copy())
-            for part in points:
+            for part in (X, w, mean, moments):
                 part[~sound] = 0.0
-        return points
-
-    @classmethod
-    def _about_mean(cls, X: np.ndarray, w: np.ndarray) -> _Points:
-        mean = (X @ w[..., None])[..., 0]
-        X = X - mean[..., None]
-        return cls(X, w, mean, (X * w[:, None]) @ X.transpose(0, 2, 1))
-
-    def _finite(self) -> np.ndarray:
-        return self.moments.trace(axis1=1, axis2=2) < _LARGEST**2
+        return cls(X, w, mean, moments)
 
     def residuals(self, camera: np.ndarray) -> np.ndarray:
         """(N,2) weighted root mean square distances under two cameras (N,2,2,3) a problem."""
         N, P = self.w.shape
-        with np.errstate(all="ignore"):
-            error = (camera.reshape(N, 4, 3) @ self.X[:, :3]).reshape(N, 2, 2, P) - self.X[:, None, 3:]
-            square = (error * error).reshape(N, 4, P) @ self.w[..., None]
-        if not np.isfinite(square).all():  # by points of no weight and absurd size
-            return self._replace(X=np.where((self.w > 0)[:, None], self.X, 0.0)).residuals(camera)
+        error = (camera.reshape(N, 4, 3) @ self.X[:, :3]).reshape(N, 2, 2, P) - self.X[:, None, 3:]
+        square = (error * error).reshape(N, 4, P) @ self.w[..., None]
         return np.sqrt(square[:, ::2, 0] + square[:, 1::2, 0])
-
-
-def _normalised(weights: np.ndarray | None, shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray | bool]:
-    """Weights (N,P) of sum 1, and whether (N,) they are sound: none negative, enough of them positive."""
-    if weights is None:
-        N, _, P = shape
-        return np.full((N, P), 1.0 / max(P, 1)), P >= MIN_POINTS
-    sound = (weights.min(1, initial=0.0) >= 0) & ((weights > 0).sum(1) >= MIN_POINTS)
-    return weights / weights.sum(1, keepdims=True), sound

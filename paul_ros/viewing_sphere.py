@@ -373,11 +373,11 @@ def _is_optimum(view: View) -> Number:
 
 def _newton_step(xp: Kind, view: View, limit: Number) -> Number:
     """Tangent step; the Hessian is shifted to be negative definite where it is not, so that the step climbs."""
-    radius = xp.sqrt(_square(view.w))
+    radius = abs(view.w)
     top, bottom = view.m + radius, view.m - radius
     m = view.m - xp.where(top < 0, 0.0, top + 0.1 * abs(bottom) + _TINY)
     step = (view.w * view.slope.conjugate() - m * view.slope) / (m * m - radius * radius + _TINY)
-    return step * xp.minimum(1.0, limit / (xp.sqrt(_square(step)) + _TINY))
+    return step * xp.minimum(1.0, limit / (abs(step) + _TINY))
 
 
 def _moved(xp: Kind, view: View, step: Number) -> Vector:
