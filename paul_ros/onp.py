@@ -14,9 +14,6 @@ import numpy as np
 
 from paul_ros.viewing_sphere import Scale, solve
 
-MIN_POINTS = 3
-"""Fewer weighted points than this leave the pose undetermined."""
-
 _LARGEST = 1e150  # its square is still a number
 
 
@@ -34,7 +31,7 @@ class OnP(NamedTuple):
             smaller by more than 1e-10 of the image's mean square about its mean (in the unit-scale problem, of the
             image's and the shape's together; in the free-scale problem of shapes whose second axis is r times as long
             as the first, by more than 1e-10 / r^2).
-        determined: (N,) bool, False where the points fix no pose: fewer than ``MIN_POINTS``, all on one line, an image
+        determined: (N,) bool, False where the points fix no pose: fewer than three, all on one line, an image
             without correlation to the shape, shape or image without extent (less than 1e-12 of its distance from the
             origin, or 1e-70) or beyond 1e150, a coordinate or weight that is no number, a negative weight. R is then
             the identity and scale 0 (1 in the unit-scale problem).
@@ -113,7 +110,7 @@ def _checked(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> tuple:
 class _Points(NamedTuple):
     """Shapes and image points of N problems as one set of 5-vectors about their mean, and its second moments.
 
-    Problems that no pose can be asked of - too few points, or a number that is none - are all zeros.
+    Problems with a number that is none, or a negative weight, are all zeros.
     """
 
     X: np.ndarray  # (N,5,P)
@@ -127,11 +124,10 @@ class _Points(NamedTuple):
         N, _, P = X.shape
         with np.errstate(all="ignore"):  # what overflows or is no number shows in the moments
             if weights is None:
-                w, sound = np.full((N, P), 1.0 / max(P, 1)), np.full(N, P >= MIN_POINTS)
+                w, sound = np.full((N, P), 1.0 / max(P, 1)), True
             else:
-                hidden = weights == 0
-                np.copyto(X, 0.0, where=hidden[:, None])
-                sound = (hidden.sum(1) <= P - MIN_POINTS) & (weights.min(1, initial=0.0) >= 0)
+                np.copyto(X, 0.0, where=(weights == 0)[:, None])
+                sound = weights.min(1, initial=0.0) >= 0
                 w = weights / weights.sum(1, keepdims=True)
             mean = (X @ w[..., None])[..., 0]
             X -= mean[..., None]

@@ -37,7 +37,7 @@ _FEW = 16
 _COLLINEAR = 1e-10  # of the shape's squared size: less beside the longest axis is no width
 _ROUNDING = 1e-12  # of a distance from the origin, or of the sizes that a correlation is of: less is none
 _STEPS = 40
-_USUAL_STEPS = 6  # array rows that need more go on without the others
+_STAGE = 5
 _STEP_LIMIT = 0.8  # radians: keeps Newton in sight of the hill it started on
 _GAIN = 1e-22  # of g, what another step from a direction that has arrived could gain
 _SLACK = 1e-11  # of g, what a proof may miss
@@ -100,15 +100,15 @@ class _Floats:
         return yes if condition else no
 
     @staticmethod
-    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None) -> View:
-        return _climb(_Floats, problem, n, scale, _STEPS, known)
+    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None, steps: int = _STEPS) -> View:
+        return _climb(_Floats, problem, n, scale, steps, known)
 
     @staticmethod
     def climbs(problem: Problem, starts: list[Vector], scale: Scale) -> list[View]:
         return [_Floats.climb(problem, n, scale) for n in starts]
 
     @staticmethod
-    def retry(method: Callable, problem: Problem, found: Solution, scale: Scale) -> Solution:
+    def retry(method: Callable, problem: Problem, found: Solution, scale: Scale, climbs: int) -> Solution:
         return method(_Floats, problem, found, scale)
 
 
@@ -122,10 +122,13 @@ class _Arrays:
         return _map(lambda y, n: np.where(condition, y, n), yes, no)
 
     @staticmethod
-    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None) -> View:
-        view = _climb(_Arrays, problem, n, scale, _USUAL_STEPS, known)
-        late = ~_arrived(problem, view) if known is None else ~_arrived(problem, view) & _apart(view.n, known)
-        _redo(view, late, lambda xp, *rest: _climb(xp, *rest, scale, _STEPS), problem, view.n)
+    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None, steps: int = _STEPS) -> View:
+        """Every few steps the rows that are late go on without the others."""
+        view = _climb(_Arrays, problem, n, scale, min(steps, _STAGE), known)
+        if steps > _STAGE:
+            rest = (problem, view.n) if known is None else (problem, view.n, known)
+            late = ~_arrived(problem, view, known)
+            _redo(view, late, lambda xp, p, n, *known: xp.climb(p, n, scale, *known or [None], steps - _STAGE), *rest)
         return view
 
     @staticmethod
@@ -136,9 +139,10 @@ class _Arrays:
         return [_take(views, slice(i * N, (i + 1) * N)) for i in range(len(starts))]
 
     @staticmethod
-    def retry(method: Callable, problem: Problem, found: Solution, scale: Scale) -> Solution:
-        """Another method where there is no proof."""
-        _redo(found, ~found.certified, lambda xp, *rest: method(xp, *rest, scale), problem, found)
+    def retry(method: Callable, problem: Problem, found: Solution, scale: Scale, climbs: int) -> Solution:
+        """Another method, of so many climbs at once, where there is no proof."""
+        few = _FEW // climbs
+        _redo(found, ~found.certified, lambda xp, *rest: method(xp, *rest, scale), problem, found, few=few)
         return found
 
 
@@ -157,9 +161,9 @@ def _take(tree: Any, rows: Any) -> Any:
     return _map(lambda values: values[rows], tree)
 
 
-def _redo(tree: Any, rows: np.ndarray, method: Callable, *inputs: Any) -> None:
+def _redo(tree: Any, rows: np.ndarray, method: Callable, *inputs: Any, few: int = _FEW) -> None:
     """Overwrite some rows of a tree with what a method makes of those rows of its inputs; few of them one by one."""
-    if np.count_nonzero(rows) > _FEW:
+    if np.count_nonzero(rows) > few:
         _map(lambda values, new: values.__setitem__(rows, new), tree, method(_Arrays, *_take(inputs, rows)))
         return
     for row in np.flatnonzero(rows):
@@ -363,8 +367,10 @@ def _stationary(view: View) -> Number:
     return _square(view.slope) <= _GAIN * view.g * (view.g + abs(view.m))
 
 
-def _arrived(problem: Problem, view: View) -> Number:
-    return _stationary(view) & (_dot(problem.c, view.n) >= 0)
+def _arrived(problem: Problem, view: View, known: Vector | None) -> Number:
+    """At a maximum on the side of the larger T, or at one that is known."""
+    done = _stationary(view) & (_dot(problem.c, view.n) >= 0)
+    return done if known is None else done | (_dot(view.n, known) >= _COS_APART)
 
 
 def _is_optimum(view: View) -> Number:
@@ -394,14 +400,13 @@ def _climb(xp: Kind, problem: Problem, n: Vector, scale: Scale, steps: int, know
     """
     view, limit = _view(xp, problem, n, scale), _STEP_LIMIT
     for _ in range(steps):
-        still, facing = _stationary(view), _dot(problem.c, view.n) >= 0
-        done = still & facing if known is None else still & facing | (_dot(view.n, known) >= _COS_APART)
-        if xp.every(done):
+        if xp.every(_arrived(problem, view, known)):
             break
         step, before = _newton_step(xp, view, limit), view.g
         n = _moved(xp, view, step)
-        if xp.any(still):
-            n = xp.where(still > facing, _opposite(view.n), n)
+        behind = _dot(problem.c, view.n) < 0
+        if xp.any(behind):
+            n = xp.where(behind & _stationary(view), _opposite(view.n), n)
         view = _view(xp, problem, n, scale)
         limit = xp.where(view.g < before, 0.3 * limit, limit)  # or steps too long could go in circles
     return view
@@ -422,20 +427,20 @@ def _start(xp: Kind, problem: Problem) -> Vector:
 
 
 def _solve(xp: Kind, problem: Problem, scale: Scale) -> Solution:
-    """The better of the optima found from the start and from its reversal; the other is its rival."""
+    """The better of the optima near the start and near the reversal of the first; the other is its rival."""
     n = _start(xp, problem)
     one = xp.climb(problem, n, scale)
-    two = xp.climb(problem, _reversal(n), scale, one.n)
+    two = xp.climb(problem, _reversal(one.n), scale, one.n)
     swap = (two.g > one.g) & _apart(two.n, one.n)
     found = _with_rival(xp, problem, xp.where(swap, two, one), xp.where(swap, one, two), scale)
-    return found if xp.every(found.certified) else xp.retry(_search, problem, found, scale)
+    return found if xp.every(found.certified) else xp.retry(_search, problem, found, scale, _SEARCH_CLIMBS)
 
 
 def _solve_alone(xp: Kind, problem: Problem, scale: Scale) -> Solution:
     """The best without a rival: one climb, and all the rest only where that ends without a proof."""
     one = xp.climb(problem, _start(xp, problem), scale)
     found = Solution(one, one, _certified(xp, problem, one, scale), one.g < 0)
-    return found if xp.every(found.certified) else xp.retry(_solve_again, problem, found, scale)
+    return found if xp.every(found.certified) else xp.retry(_solve_again, problem, found, scale, 1)
 
 
 def _solve_again(xp: Kind, problem: Problem, found: Solution, scale: Scale) -> Solution:

@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-DOCUMENTS = [ROOT / "README.md", ROOT / "training/README.md", ROOT / "bags/README.md", *ROOT.glob("benchmarks/*.md")]
+DOCUMENTS = [
+    ROOT / "README.md",
+    ROOT / "training/README.md",
+    ROOT / "bags/README.md",
+    *ROOT.glob("benchmarks/*.md"),
+    *ROOT.glob("docs/*.md"),
+]
 _LINK = re.compile(r'\]\(<?([^)\s>]+)|\b(?:src|href)="([^"]+)"')
 
 
