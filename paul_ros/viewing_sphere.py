@@ -377,18 +377,17 @@ def _is_optimum(view: View) -> Number:
     return _stationary(view) & (view.m < 0) & (view.m * view.m > _square(view.w))
 
 
-def _newton_step(xp: Kind, view: View, limit: Number) -> Number:
-    """Tangent step; the Hessian is shifted to be negative definite where it is not, so that the step climbs."""
-    radius = abs(view.w)
-    top, bottom = view.m + radius, view.m - radius
-    m = view.m - xp.where(top < 0, 0.0, top + 0.1 * abs(bottom) + _TINY)
-    step = (view.w * view.slope.conjugate() - m * view.slope) / (m * m - radius * radius + _TINY)
-    return step * xp.minimum(1.0, limit / (abs(step) + _TINY))
-
-
-def _moved(xp: Kind, view: View, step: Number) -> Vector:
-    (n0, n1, n2), (u0, u1, u2), back = view.n, view.u, step.conjugate()
-    over = 1 / xp.sqrt(1 + (step * back).real)
+def _stepped(xp: Kind, view: View, limit: Number) -> Vector:
+    """The direction a Newton step away; the Hessian is shifted to be negative definite where it is not: uphill."""
+    (n0, n1, n2), (u0, u1, u2), _, _, _, slope, m, w = view
+    radius = abs(w)
+    top = m + radius
+    m = m - (top >= 0) * (top + 0.1 * abs(m - radius) + _TINY)
+    step = (w * slope.conjugate() - m * slope) / (m * m - radius * radius + _TINY)
+    length = abs(step)
+    shrink = xp.minimum(1.0, limit / (length + _TINY))
+    length, back = shrink * length, shrink * step.conjugate()
+    over = 1 / xp.sqrt(1 + length * length)
     return ((n0 + (back * u0).real) * over, (n1 + (back * u1).real) * over, (n2 + (back * u2).real) * over)
 
 
@@ -402,13 +401,12 @@ def _climb(xp: Kind, problem: Problem, n: Vector, scale: Scale, steps: int, know
     for _ in range(steps):
         if xp.every(_arrived(problem, view, known)):
             break
-        step, before = _newton_step(xp, view, limit), view.g
-        n = _moved(xp, view, step)
+        n, before = _stepped(xp, view, limit), view.g
         behind = _dot(problem.c, view.n) < 0
         if xp.any(behind):
             n = xp.where(behind & _stationary(view), _opposite(view.n), n)
         view = _view(xp, problem, n, scale)
-        limit = xp.where(view.g < before, 0.3 * limit, limit)  # or steps too long could go in circles
+        limit = limit * (1.0 - 0.7 * (view.g < before))  # or steps too long could go in circles
     return view
 
 
