@@ -31,7 +31,15 @@ def paul(*arguments):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["replay", "--help"], ["inspect", "--help"], ["demo", "--help"], ["train", "--help"]]
+    "arguments",
+    [
+        ["--help"],
+        ["replay", "--help"],
+        ["inspect", "--help"],
+        ["demo", "--help"],
+        ["train", "--help"],
+        ["benchmark", "--help"],
+    ],
 )
 def test_help(arguments, capsys):
     with pytest.raises(SystemExit) as end:
