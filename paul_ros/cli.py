@@ -150,7 +150,8 @@ columns, a line for each scenario and method:
   better    how many leave less than ours
   angle     degrees to the optimum, median; then the 95th percentile
   ratio     residual over that of the optimum, median; then the largest
-  µs        of one pose, called alone: best of several calls, median of several problems
+  µs        of one pose, called alone: best of several calls, median of several problems; for polar and majorise,
+            which have no way of their own for single poses, mostly the price of numpy's calls
   µs batch  a pose, in one call with --batch of them
   x lsq     the time before it over that of lsq_svd
 "More" and "less" are by 1e-9 of the image's mean square, in means of squared distances. Noise is the standard
@@ -177,8 +178,8 @@ def _add_benchmark_onp(subjects: argparse._SubParsersAction) -> None:
     parser = subjects.add_parser(
         "onp",
         help="orthographic-N-point: optimality, residuals and times of five solvers",
-        description="Solve random orthographic-N-point problems by five methods and compare them with the optimum that "
-        "a naive search finds. One thread. Then the 3D error where the shape is known up to 20 % noise.",
+        description="Solve random orthographic-N-point problems by five methods and compare them with the optimum\n"
+        "that a naive search finds. One thread. Then the 3D error where the shape is known up to 20 % noise.",
         epilog=_ONP_COLUMNS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -188,17 +189,22 @@ def _add_benchmark_onp(subjects: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--batch", metavar="N", type=_positive, default=10_000, help="poses in one call (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the random problems (default: %(default)s)")
+    parser.add_argument("--seed", type=_natural, default=0, help="of the random problems (default: %(default)s)")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write all rows as JSON")
     parser.add_argument("--plot", metavar="FILE.png", type=Path, help="draw angles, residuals, times and 3D errors")
     parser.set_defaults(run=_benchmark_onp)
 
 
 def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number} is less than 1")
-    return number
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is no whole number above 0")
+    return int(text)
+
+
+def _natural(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is no whole number from 0 on")
+    return int(text)
 
 
 def _benchmark_onp(args: argparse.Namespace) -> None:
@@ -212,9 +218,9 @@ def _benchmark_onp(args: argparse.Namespace) -> None:
 
     check_outputs([args.json, args.plot], [])
     report = run(args.cases, args.batch, args.seed)
-    if args.json:
-        write_json(args.json, report)
     try:
+        if args.json:
+            write_json(args.json, report)
         if args.plot:
             write_picture(args.plot, report)
     finally:

@@ -37,7 +37,7 @@ _FEW = 16
 _COLLINEAR = 1e-10  # of the shape's squared size: less beside the longest axis is no width
 _ROUNDING = 1e-12  # of a distance from the origin, or of the sizes that a correlation is of: less is none
 _STEPS = 40
-_STAGE = 5
+_USUAL_STEPS = 6
 _STEP_LIMIT = 0.8  # radians: keeps Newton in sight of the hill it started on
 _GAIN = 1e-22  # of g, what another step from a direction that has arrived could gain
 _SLACK = 1e-11  # of g, what a proof may miss
@@ -57,6 +57,7 @@ class Poses(NamedTuple):
         certified: (N,) bool, the best is proven to be the best of all.
         two_fold: (N,) bool, the rival is an optimum, not only the reversal of the best.
         determined: (N,) bool, the points fix a pose.
+        extent: (N,) root mean square distance of the image points from their mean.
     """
 
     R: np.ndarray
@@ -65,6 +66,7 @@ class Poses(NamedTuple):
     certified: np.ndarray
     two_fold: np.ndarray
     determined: np.ndarray
+    extent: np.ndarray
 
 
 def solve(moments: np.ndarray, mean: np.ndarray, scale: Scale, rivals: bool = True) -> Poses:
@@ -75,19 +77,24 @@ def solve(moments: np.ndarray, mean: np.ndarray, scale: Scale, rivals: bool = Tr
         mean: (N,5) their weighted means.
         scale: which of the two goals.
         rivals: whether to look for second optima, half of the work; without, the best stands in for its rival.
+
+    Raises:
+        ValueError: there is no such scale.
     """
+    if scale not in ("free", "unit"):
+        raise ValueError(f"scale is 'free' or 'unit', not {scale!r}")
     N, method = len(moments), _solve if rivals else _solve_alone
     a, axes = np.linalg.eigh(moments[:, :3, :3])
     inputs = (moments.reshape(N, 25), mean, a, axes.reshape(N, 9))
     if N <= _FEW:
         answers = [_answer(_Floats, *row, scale, method) for row in zip(*(part.tolist() for part in inputs))]
-        table = np.array(answers, dtype=float).reshape(N, 27)
+        table = np.array(answers, dtype=float).reshape(N, 28)
     else:
         with np.errstate(over="ignore"):  # of means beyond all reason, which fix no pose
             table = np.stack(_answer(_Arrays, *(list(part.T.copy()) for part in inputs), scale, method), axis=1)
     poses = table[:, :24].reshape(N, 2, 12)
-    flags = table[:, 24:].T > 0
-    return Poses(poses[:, :, :9].reshape(N, 2, 3, 3), poses[:, :, 9], poses[:, :, 10:], *flags)
+    flags = table[:, 24:27].T > 0
+    return Poses(poses[:, :, :9].reshape(N, 2, 3, 3), poses[:, :, 9], poses[:, :, 10:], *flags, table[:, 27])
 
 
 class _Floats:
@@ -100,8 +107,8 @@ class _Floats:
         return yes if condition else no
 
     @staticmethod
-    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None, steps: int = _STEPS) -> View:
-        return _climb(_Floats, problem, n, scale, steps, known)
+    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None) -> View:
+        return _climb(_Floats, problem, n, scale, _STEPS, known)
 
     @staticmethod
     def climbs(problem: Problem, starts: list[Vector], scale: Scale) -> list[View]:
@@ -122,13 +129,13 @@ class _Arrays:
         return _map(lambda y, n: np.where(condition, y, n), yes, no)
 
     @staticmethod
-    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None, steps: int = _STEPS) -> View:
-        """Every few steps the rows that are late go on without the others."""
-        view = _climb(_Arrays, problem, n, scale, min(steps, _STAGE), known)
-        if steps > _STAGE:
-            rest = (problem, view.n) if known is None else (problem, view.n, known)
-            late = ~_arrived(problem, view, known)
-            _redo(view, late, lambda xp, p, n, *known: xp.climb(p, n, scale, *known or [None], steps - _STAGE), *rest)
+    def climb(problem: Problem, n: Vector, scale: Scale, known: Vector | None = None) -> View:
+        """After the usual number of steps the rows that are late go on without the others."""
+        view = _climb(_Arrays, problem, n, scale, _USUAL_STEPS, known)
+        rest = (problem, view.n) if known is None else (problem, view.n, known)
+        _redo(
+            view, ~_arrived(problem, view, known), lambda xp, p, *n: _climb(xp, p, n[0], scale, _STEPS, *n[1:]), *rest
+        )
         return view
 
     @staticmethod
@@ -162,7 +169,10 @@ def _take(tree: Any, rows: Any) -> Any:
 
 
 def _redo(tree: Any, rows: np.ndarray, method: Callable, *inputs: Any, few: int = _FEW) -> None:
-    """Overwrite some rows of a tree with what a method makes of those rows of its inputs; few of them one by one."""
+    """Overwrite some rows of a tree with what a method makes of those rows of its inputs.
+
+    More than a few go as arrays, the others one by one on floats, where the method's fixed price as arrays is higher.
+    """
     if np.count_nonzero(rows) > few:
         _map(lambda values, new: values.__setitem__(rows, new), tree, method(_Arrays, *_take(inputs, rows)))
         return
@@ -224,7 +234,7 @@ def _answer(
     scale: Scale,
     method: Callable,
 ) -> list[Number]:
-    """Best and rival as ``_pose`` gives them, then three flags; from 25 moments, 5 means, and the shape's axes."""
+    """Best and rival as ``_pose`` gives them, three flags, extent; from 25 moments, 5 means, and the shape's axes."""
     S_square, W_square = M[0] + M[6] + M[12], M[18] + M[24]
     over_S, over_W = 1 / (S_square + _TINY), 1 / (W_square + _TINY)
     over_both = xp.sqrt(over_S) * xp.sqrt(over_W)
@@ -232,7 +242,8 @@ def _answer(
     axes = (_cross(v1, v2), v1, v2)
     b = ((M[15] + 1j * M[20]) * over_both, (M[16] + 1j * M[21]) * over_both, (M[17] + 1j * M[22]) * over_both)
     d = (_dot(b, axes[0]), _dot(b, v1), _dot(b, v2))
-    zoom = xp.sqrt(W_square) * xp.sqrt(over_S)
+    extent = xp.sqrt(W_square)
+    zoom = extent * xp.sqrt(over_S)
     problem = Problem((a[0] * over_S, a[1] * over_S, a[2] * over_S), d, _cross_of_parts(d), 1 / (1 + zoom))
     # Where the second eigenvalue vanishes all points lie on one line, and turns about that line show nowhere.
     determined = (
@@ -242,12 +253,12 @@ def _answer(
         & (_square(d[0]) + _square(d[1]) + _square(d[2]) > _ROUNDING**2)
     )
     if xp.every(determined):
-        return [*_poses(xp, method(xp, problem, scale), axes, mean, zoom, scale), determined]
+        return [*_poses(xp, method(xp, problem, scale), axes, mean, zoom, scale), determined, extent]
     found = method(xp, xp.where(determined, problem, _HARMLESS), scale)
     answer = [*_poses(xp, found, axes, mean, zoom, scale), determined]
     nothing = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     nothing += [1.0, mean[3] - mean[0], mean[4] - mean[1]] if scale == "unit" else [0.0, mean[3], mean[4]]
-    return [xp.where(determined, x, y) for x, y in zip(answer, 2 * nothing + 3 * [False])]
+    return [*(xp.where(determined, x, y) for x, y in zip(answer, 2 * nothing + 3 * [False])), extent]
 
 
 def _poses(xp: Kind, found: Solution, *rest: Any) -> list[Number]:
@@ -260,8 +271,8 @@ def _pose(
     xp: Kind, view: View, axes: tuple[Vector, Vector, Vector], mean: Sequence[Number], zoom: Number, scale: Scale
 ) -> list[Number]:
     """Nine entries of R, row by row, the scale and the two of the translation."""
-    length = xp.sqrt(_square(view.z)) + _TINY
-    turn = view.z / length
+    length = abs(view.z)
+    turn = xp.where(length > _TINY, view.z, 1.0) / xp.where(length > _TINY, length, 1.0)
     (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = axes
     n0, n1, n2 = view.n
     q0, q1, q2 = view.u[0] * turn, view.u[1] * turn, view.u[2] * turn

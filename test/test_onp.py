@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from naive_onp import centred, naive_residual, rms
 from scipy.spatial.transform import Rotation
 
+from paul_ros import viewing_sphere
 from paul_ros.onp import _Points, onp
 from paul_ros.viewing_sphere import solve
 
@@ -160,7 +161,7 @@ def test_exact_views_give_the_exact_pose(scale, count):
     found = onp(S, W, scale=scale)
     np.testing.assert_allclose(found.R, R, atol=1e-7)
     np.testing.assert_allclose(found.scale, 1, rtol=1e-7)
-    assert found.certified.all() and (found.ambiguity < 1e-6).all()
+    assert found.certified.all() and (found.ambiguity < 1e-5).all()
 
 
 @BOTH_SCALES
@@ -513,3 +514,65 @@ def test_wrong_shapes_are_refused():
         onp(np.zeros((2, 3, 5)), np.zeros((2, 2, 4)))
     with pytest.raises(ValueError, match="weights"):
         onp(np.zeros((2, 3, 5)), np.zeros((2, 2, 5)), np.ones((2, 4)))
+
+
+# --- the sphere of viewing directions
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_goal_has_the_derivatives_that_the_climb_goes_by(scale):
+    """Slope and Hessian against differences along great circles, far from any optimum."""
+    rng = np.random.default_rng(30)
+    a, d = np.sort(rng.random(3)), rng.standard_normal(3) + 1j * rng.standard_normal(3)
+    a, d = tuple((a / a.sum()).tolist()), tuple((d / 3).tolist())
+    problem = viewing_sphere.Problem(a, d, viewing_sphere._cross_of_parts(d), 0.4)
+    n = rng.standard_normal(3)
+    n = tuple((n / np.linalg.norm(n)).tolist())
+    at = viewing_sphere._view(viewing_sphere._Floats, problem, n, scale)
+    step = 1e-4
+    for way in (1, 1j, (1 + 1j) / 2**0.5):
+        along = np.array([(np.conj(way) * u).real for u in at.u])
+        near = [np.cos(h) * np.array(n) + np.sin(h) * along for h in (-step, step)]
+        low, high = (viewing_sphere._view(viewing_sphere._Floats, problem, tuple(x), scale).g for x in near)
+        assert (high - low) / (2 * step) == pytest.approx((np.conj(way) * at.slope).real, abs=1e-6)
+        bend = at.m + (at.w * np.conj(way) ** 2).real
+        assert (high - 2 * at.g + low) / step**2 == pytest.approx(bend, abs=1e-5)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_direction_beside_the_optimum_is_not_certified(scale):
+    rng = np.random.default_rng(31)
+    for _ in range(50):
+        d = rng.standard_normal(3) + 1j * rng.standard_normal(3)
+        d = tuple((d / np.linalg.norm(d) / 2).tolist())
+        problem = viewing_sphere.Problem((0.1, 0.3, 0.6), d, viewing_sphere._cross_of_parts(d), 0.5)
+        best = viewing_sphere._solve(viewing_sphere._Floats, problem, scale)
+        beside = np.array(best.best.n) + 1e-7 * rng.standard_normal(3)
+        view = viewing_sphere._view(viewing_sphere._Floats, problem, tuple(beside / np.linalg.norm(beside)), scale)
+        assert best.certified and not viewing_sphere._certified(viewing_sphere._Floats, problem, view, scale)
+
+
+@pytest.mark.parametrize("batch", [1, 17, 400, 4000])
+def test_needles_get_the_same_answers_in_batches_of_every_size(batch):
+    """On narrow hills climbs go in circles unless their steps keep shrinking."""
+    rng = np.random.default_rng(32)
+    S = rng.standard_normal((4000, 3, 9)) * np.array([1.0, 0.01, 0.01])[:, None]
+    W = S[:, :2] + rng.standard_normal((4000, 2, 9))
+    rows = range(0, 4000 if batch > 1 else 400, batch)
+    assert all(onp(S[i : i + batch], W[i : i + batch]).certified.all() for i in rows)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("points", [3, 12])
+def test_exact_views_of_planes_are_ambiguous(scale, points):
+    """Both residuals are rounding then, and their ratio must not be."""
+    S, W, _ = random_problems(200, points, 0.0, seed=33, flat=0.0)
+    found = onp(S, W, scale=scale)
+    assert (found.ambiguity[found.two_fold] > 0.9).all() and found.two_fold.mean() > 0.9
+
+
+def test_an_unknown_scale_is_refused():
+    S, W, _ = random_problems(2, 5, 0.0, seed=34)
+    for scale in ("Unit", "fixed", None):
+        with pytest.raises(ValueError, match="scale is 'free' or 'unit'"):
+            onp(S, W, scale=scale)

@@ -132,3 +132,21 @@ def test_shapes_that_are_no_numbers_are_left_to_the_loss():
     found = optimal_camera(S, W, visible)
     torch.testing.assert_close(found.R[2], torch.eye(3, dtype=torch.double))
     assert torch.isfinite(found.R).all() and found.scale[2] == 0
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("solver", [optimal_camera, solve_camera])
+def test_collapsed_shapes_get_rotations_all_the_same(scale, solver):
+    """In single precision, as in training, where a network's first shapes may lie on a line or in a point."""
+    S, _, W, visible = problem(60)
+    along = torch.randn(60, 3, 1, generator=torch.Generator().manual_seed(0))
+    line, point = along * torch.linspace(-1, 1, 12), along.expand(60, 3, 12)
+    for shape in (line, point, 1e-6 * S.float()):
+        found = solver(shape, W.float(), visible, scale)
+        torch.testing.assert_close(torch.linalg.det(found.R), torch.ones(60), atol=1e-4, rtol=0)
+        assert torch.isfinite(found.scale).all()
+
+
+def test_an_unknown_solver_is_refused():
+    with pytest.raises(ValueError, match="solver is 'exact' or 'algebraic'"):
+        solve_streams(*streams(), "Exact")

@@ -7,7 +7,8 @@ Three ways, for different losses:
   scale.  Solved exactly, its solution needs no gradient of its own where the training loss is the same squared cost:
   at an optimum the cost does not change with the pose (envelope theorem).
 - ``solve_camera`` is the exact optimum as a differentiable function, for every other loss: one Newton step is recorded
-  at the optimum, whose derivative is that of the optimum itself (implicit function theorem).
+  at the optimum, whose derivative is that of the optimum itself (implicit function theorem). ``objective.py`` trains
+  with it, for its losses are unsquared and more than one.
 - ``algebraic_camera`` is the paper's own approximation, least squares projected onto the rotations (section 4.2).
 
 Exact means the global optimum of ``paul_ros.onp``, which solves on the CPU; only second moments, 25 numbers a shape,
@@ -64,7 +65,12 @@ def solve_streams(
 
     Returns:
         R (N,3,3) and z (N,P), the depth about the mean of the visible points.
+
+    Raises:
+        ValueError: there is no such solver.
     """
+    if solver not in ("exact", "algebraic"):
+        raise ValueError(f"solver is 'exact' or 'algebraic', not {solver!r}")
     mean = centre(S_ae + S_ad, visible) / 2
     if solver == "exact":
         R = optimal_camera(mean, W, visible, "unit").R
@@ -88,7 +94,8 @@ def optimal_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free")
         where they fix none (and scale 0 if that is free).
     """
     X = centre(torch.cat([S, W], dim=1), visible) * visible[:, None]
-    moments = (X @ X.transpose(1, 2)).double().cpu().numpy()
+    X = X.double()  # in single precision what lies on one line would not look so
+    moments = (X @ X.transpose(1, 2)).cpu().numpy()
     moments[~np.isfinite(moments).all((1, 2))] = 0.0  # a training that diverged: its loss will tell
     poses = viewing_sphere.solve(moments, np.zeros(moments.shape[:2]), scale, rivals=False)
     R, s = (torch.from_numpy(part[:, 0]).to(S) for part in (poses.R, poses.scale))
@@ -144,7 +151,7 @@ def _affine_camera(A: Tensor, B: Tensor) -> Tensor:
 
 
 def _goal(A: Tensor, B: Tensor, n: Tensor, scale: Scale) -> tuple[Tensor, Tensor]:
-    """Gradient (N,3) and Hessian (N,3,3) of the goal at directions n; docs/onp.md has A, B, c, D, T and the goals."""
+    """Gradient (N,3) and Hessian (N,3,3) of the goal at its optima n; docs/onp.md has A, B, c, D, T and the goals."""
     c, D = torch.linalg.cross(B[:, 0], B[:, 1]), B.transpose(1, 2) @ B
     An, Dn = _times(A, n), _times(D, n)
     T = (_trace(D)[:, 0, 0] + (n * (2 * c - Dn)).sum(1)).clamp_min(1e-18)[:, None]
@@ -156,8 +163,8 @@ def _goal(A: Tensor, B: Tensor, n: Tensor, scale: Scale) -> tuple[Tensor, Tensor
     across = (_trace(A)[:, 0] - (n * An).sum(1, keepdim=True)).clamp_min(1e-9)
     g = T / across
     dg = (dT + 2 * g * An) / across
-    twist = dg[:, :, None] * An[:, None]
-    return dg, 2 * (g[..., None] * A - D + twist + twist.transpose(1, 2)) / across[..., None]
+    # The products of the two slopes are left out: at an optimum they vanish across n.
+    return dg, 2 * (g[..., None] * A - D) / across[..., None]
 
 
 def _newton_step(A: Tensor, B: Tensor, n: Tensor, scale: Scale) -> Tensor:
@@ -199,7 +206,8 @@ def _pose(A: Tensor, B: Tensor, n: Tensor, scale: Scale) -> Camera:
     real = (e1 * B[:, 0]).sum(1) + (e2 * B[:, 1]).sum(1)
     imaginary = (e1 * B[:, 1]).sum(1) - (e2 * B[:, 0]).sum(1)
     size = (real.square() + imaginary.square()).clamp_min(1e-18).sqrt()
-    cos, sin = (real / size)[:, None], (imaginary / size)[:, None]
+    cos = torch.where(size > 1e-9, real / size, torch.ones_like(size))[:, None]  # some rotation where any will do
+    sin = torch.where(size > 1e-9, imaginary / size, torch.zeros_like(size))[:, None]
     R = torch.stack([cos * e1 - sin * e2, sin * e1 + cos * e2, n], 1)
     if scale == "unit":
         return Camera(R, torch.ones_like(size)[:, None, None])
