@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from paul_ros.model import load_model
-from training.networks import Paul
+from training.networks import build_networks
 from training.recipe import Recipe
 from training.solver import centre, solve_streams
 
@@ -64,7 +64,7 @@ class Run:
         torch.manual_seed(0)
         recipe, layout = Recipe(), load_model().layout
         self.solver, self.W, self.visible = SOLVERS[solver], W, visible
-        self.networks = Paul(layout, recipe.bottleneck, list(recipe.hidden), recipe.width, recipe.blocks)
+        self.networks = build_networks(layout, recipe, len(self.W))
         self.adam = torch.optim.Adam(self.networks.parameters(), recipe.learning_rate, fused=True)
 
     def step(self) -> float:

@@ -196,10 +196,12 @@ def test_forward_pass_equals_torch(saved):
     code = f"""
 import numpy as np, torch
 from paul_ros.model import load_model, normalise
-from training.networks import Paul
+from training.networks import build_networks
+from training.recipe import Recipe
 model = load_model({str(saved)!r})
 a = model.header["architecture"]
-paul = Paul(model.layout, 3, a["decoder"]["hidden"], a["encoder"]["width"], a["encoder"]["blocks"])
+settings = dict(bottleneck=3, hidden=a["decoder"]["hidden"], width=a["encoder"]["width"], blocks=a["encoder"]["blocks"])
+paul = build_networks(model.layout, Recipe.from_dict(settings), 5)
 paul.load_state_dict({{k: torch.from_numpy(v) for k, v in model.weights.items()}}, strict=False)
 rng = np.random.default_rng(0)
 W, visible = rng.standard_normal((5, 2, 17)), rng.random((5, 17)) < 0.8

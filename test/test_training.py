@@ -21,7 +21,7 @@ from training import cli, human_data
 from training.data import DataError, load_training_data
 from training.export import mean_shape, metres_per_unit
 from training.mocap import CMU31
-from training.networks import Paul
+from training.networks import build_networks
 from training.objective import Views, bone_variation, handedness_violation, paul_terms, undo_perspective
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.solver import centre
@@ -78,7 +78,7 @@ def batch(image, visible, calibrated=False):
 
 def test_objective_does_not_see_hidden_points():
     torch.manual_seed(0)
-    networks = Paul(COCO, 4, [8, 16], 16, 1)
+    networks = build_networks(COCO, Recipe.from_dict({"bottleneck": 4, "hidden": [8, 16], "width": 16, "blocks": 1}), 8)
     W = torch.from_numpy(views(8)[0]) / 100
     visible = torch.from_numpy(np.random.default_rng(0).random((8, 17)) < 0.7)
     terms = paul_terms(networks, COCO, batch(W, visible))

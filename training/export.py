@@ -73,7 +73,7 @@ def _weights(trainer: Trainer) -> dict[str, np.ndarray]:
     return {
         name: value.numpy()
         for name, value in trainer.networks.state_dict().items()
-        if not name.startswith("shape_encoder.")
+        if name.startswith(("encoder.", "decoder."))
     }
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The three networks of the paper: 2D encoder h, shape decoder f_d, shape encoder f_e.
+"""The networks of the paper: 2D encoder h (or free codes), shape decoder f_d, shape encoder f_e.
 
 Parameter names are those of the model file, so that the trained encoder and decoder are exported as they are.
 """
@@ -11,6 +11,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from paul_ros.skeleton import Layout
+from training.recipe import Recipe
+
+_FREE_CODE_SIZE = 0.1
+"""Standard deviation of free codes at the start: a tenth or ten times of it trained worse."""
 
 
 class ResidualBlock(nn.Module):
@@ -41,24 +45,28 @@ class PointEncoder(nn.Module):
 
 
 class ShapeDecoder(nn.ModuleList):
-    """f_d: codes (N,K) to canonical shapes (N,3,P) in model units."""
+    """f_d: codes (N,K) to canonical shapes (N,3,P) in model units, centred on their mean.
 
-    def __init__(self, layout: Layout, bottleneck: int, hidden: list[int]) -> None:
+    ``unit_size``: shapes are of unit size (``to_unit_size``), as their scale is a camera's; else they keep their own.
+    """
+
+    def __init__(self, layout: Layout, bottleneck: int, hidden: tuple[int, ...], unit_size: bool) -> None:
         sizes = [bottleneck, *hidden, 3 * len(layout.names)]
         super().__init__(nn.Linear(inputs, outputs) for inputs, outputs in zip(sizes, sizes[1:]))
-        self.layout = layout
+        self.layout, self.unit_size = layout, unit_size
 
     def forward(self, code: Tensor) -> Tensor:
         *inner, last = self
         for layer in inner:
             code = F.elu(layer(code))
-        return to_unit_size(last(code).unflatten(1, (3, -1)), self.layout)
+        S = last(code).unflatten(1, (3, -1))
+        return to_unit_size(S, self.layout) if self.unit_size else S - S.mean(2, keepdim=True)
 
 
 class ShapeEncoder(nn.ModuleList):
     """f_e: canonical shapes (N,3,P) to codes (N,K); the decoder's layers in reverse."""
 
-    def __init__(self, points: int, bottleneck: int, hidden: list[int]) -> None:
+    def __init__(self, points: int, bottleneck: int, hidden: tuple[int, ...]) -> None:
         sizes = [3 * points, *reversed(hidden), bottleneck]
         super().__init__(nn.Linear(inputs, outputs) for inputs, outputs in zip(sizes, sizes[1:]))
 
@@ -71,14 +79,46 @@ class ShapeEncoder(nn.ModuleList):
 
 
 class Paul(nn.Module):
-    """h, f_d and f_e together."""
+    """The networks together.
 
-    def __init__(self, layout: Layout, bottleneck: int, hidden: list[int], width: int, blocks: int) -> None:
+    Codes come from h, or are free variables of the training frames (``free_codes``, None where h gives them).  h is
+    there in either case: the model file needs one.
+    """
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        decoder: ShapeDecoder,
+        shape_encoder: ShapeEncoder,
+        free_codes: nn.Embedding | None = None,
+    ) -> None:
         super().__init__()
-        points = len(layout.names)
-        self.encoder = PointEncoder(points, bottleneck, width, blocks)
-        self.decoder = ShapeDecoder(layout, bottleneck, hidden)
-        self.shape_encoder = ShapeEncoder(points, bottleneck, hidden)
+        self.encoder, self.decoder, self.shape_encoder = encoder, decoder, shape_encoder
+        self.free_codes = free_codes
+
+    def codes(self, W: Tensor, visible: Tensor, rows: Tensor) -> Tensor:
+        """Codes (N,K) of normalised image points W (N,2,P) with visibility (N,P); rows (N,) are their frame numbers.
+
+        Free codes are looked up by frame number; else they are h(W, visible) and the numbers are not looked at.
+        """
+        return self.encoder(W, visible) if self.free_codes is None else self.free_codes(rows)
+
+
+def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
+    """The recipe's networks for a layout, with fresh weights from torch's default generator.
+
+    Args:
+        frames: number of training frames, for free codes.
+    """
+    points, K = len(layout.names), recipe.bottleneck
+    encoder = PointEncoder(points, K, recipe.width, recipe.blocks)
+    decoder = ShapeDecoder(layout, K, recipe.hidden, unit_size=recipe.scale == "free")
+    shape_encoder = ShapeEncoder(points, K, recipe.hidden)
+    free_codes = None
+    if recipe.codes == "free":
+        free_codes = nn.Embedding(frames, K)
+        nn.init.normal_(free_codes.weight, std=_FREE_CODE_SIZE)
+    return Paul(encoder, decoder, shape_encoder, free_codes)
 
 
 def to_unit_size(S: Tensor, layout: Layout) -> Tensor:

@@ -18,12 +18,19 @@ class RecipeError(ValueError):
     """A recipe that cannot be used; the text says what to do."""
 
 
+#: Settings that are one of a few words.
+CHOICES = {"codes": ("encoder", "free"), "encoder": ("residual", "convolutional"), "scale": ("free", "unit")}
+
+
 @dataclass(frozen=True)
 class Recipe:
     """Settings of a run. Where a default departs from the paper's, the comment says so."""
 
     bottleneck: int = 8  # K; the paper: 4 for small or rigid objects, 8 for articulated ones
     hidden: tuple[int, ...] = (16, 32, 64, 128, 256)  # f_d from the code upwards; f_e is its reverse
+    codes: str = "encoder"  # phi = h(W, M), to lift what was never seen; free: one code a frame, the paper's NRSfM
+    encoder: str = "residual"  # or convolutional, as Deep NRSfM's; see networks.py
+    scale: str = "free"  # every frame has its own; unit: orthographic views of one fixed scale, as NRSfM's benchmarks
     width: int = 256  # of the 2D encoder's residual blocks
     blocks: int = 2
     steps: int = 20_000
@@ -68,6 +75,8 @@ class Recipe:
         return cls(**{key: _converted(key, value, fields[key].default) for key, value in settings.items()})
 
     def __post_init__(self) -> None:
+        for name, known in CHOICES.items():
+            self._need(name, getattr(self, name) in known, f"one of {', '.join(known)}")
         for name in ("bottleneck", "width", "blocks", "steps", "batch", "learning_rate"):
             self._need(name, getattr(self, name) > 0, "positive")
         for name in ("code_weight", "decay_weight", "handedness_weight", "bone_weight", "roll"):
@@ -131,6 +140,8 @@ def _converted(key: str, value: object, default: object) -> object:
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
         return tuple(tuple(item) if isinstance(item, list) else item for item in value)
     if isinstance(default, bool) and isinstance(value, bool):
+        return value
+    if isinstance(default, str) and isinstance(value, str):
         return value
     if type(default) in (int, float) and type(value) in (int, float, str):
         try:

@@ -17,7 +17,7 @@ from paul_ros.files import write_atomically
 from paul_ros.model import min_visible, normalise
 from paul_ros.skeleton import Layout
 from training.data import TrainingData
-from training.networks import Paul
+from training.networks import Paul, build_networks
 from training.objective import Terms, Views, paul_terms
 from training.recipe import Recipe
 
@@ -45,7 +45,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(recipe.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.seed)
-            self.networks = Paul(data.layout, recipe.bottleneck, list(recipe.hidden), recipe.width, recipe.blocks)
+            self.networks = build_networks(data.layout, recipe, len(data.W))
         self.optimizer = torch.optim.Adam(self.networks.parameters(), lr=recipe.learning_rate, fused=True)
         self.step, self.seconds, self.rows = 0, 0.0, []
         self._W = torch.from_numpy(data.W)
