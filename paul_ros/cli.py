@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from paul_ros import __version__
@@ -22,8 +24,8 @@ class Ticker:
     def __enter__(self) -> Ticker:
         return self
 
-    def __call__(self) -> None:
-        self.count += 1
+    def __call__(self, count: int = 1) -> None:
+        self.count += count
         if sys.stderr.isatty() and time.monotonic() - self._shown > 0.1:
             self._shown = time.monotonic()
             print(f"\r{self.what}: {self.count} frames", end="", file=sys.stderr, flush=True)
@@ -227,6 +229,75 @@ def _benchmark_onp(args: argparse.Namespace) -> None:
         print(table(report))
 
 
+_EVALUATE_EXAMPLES = """\
+DATA is an npz with
+  W (F,2,P)        image points, y down; one scale for S and W
+  S (F,3,P)        the truth in the camera frame; NaN where it is not known
+  visible (F,P)    optional; the model sees visible points only, errors are over all of them
+  edges (E,2)      optional, for the picture
+  metres           optional, true: distances are then given in mm, else in units of W
+
+examples:
+  paul evaluate person.npz unseen.npz --json errors.json --plot errors.png
+                         every frame lifted alone: encoder, decoder, orthographic-N-point
+  paul evaluate shapes.npz --truth drink.npz
+                         what `paul train --shapes shapes.npz` reconstructed, same frames, same order
+
+NE is |S - truth| / |truth| of the centred shapes, no alignment. Mirror images look alike under an orthographic camera:
+"flip per frame" forgives each frame, "one flip for all" only the whole set. The baseline is the rigid mean shape.
+"""
+
+
+def _add_evaluate(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "evaluate",
+        help="judge a model on unseen frames, or a reconstruction, against the 3D truth",
+        description="Judge a model on frames it never saw, each lifted alone, or a saved reconstruction.",
+        epilog=_EVALUATE_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("model", metavar="MODEL", help="model file or shipped model; with --truth saved shapes (.npz)")
+    parser.add_argument("data", metavar="DATA", type=Path, nargs="?", help="npz with W and the truth S, see below")
+    parser.add_argument("--truth", metavar="DATA", type=Path, help="MODEL holds shapes: judge them by this npz")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the report as JSON")
+    parser.add_argument("--plot", metavar="FILE.png", type=Path, help="draw frames over their truth, and all errors")
+    parser.set_defaults(run=_evaluate, usage_error=parser.error)
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    from paul_ros.bag import check_outputs
+    from paul_ros.report import write_json
+
+    if (args.data is None) == (args.truth is None):
+        args.usage_error("name DATA for a model, or --truth DATA for saved shapes")
+    check_outputs([args.json, args.plot], [args.model, args.data, args.truth])
+    with _training_packages():
+        from training import evaluation
+    if args.truth:
+        with _training_packages():
+            report, compared = evaluation.evaluate_shapes(args.model, args.truth)
+    else:
+        with Ticker("evaluate") as tick:
+            report, compared = evaluation.evaluate_model(args.model, args.data, tick)
+    if args.json:
+        write_json(args.json, report)
+    try:
+        if args.plot:
+            from training.evaluation_picture import write_picture
+
+            write_picture(args.plot, compared, f"{Path(args.model).stem} on {compared.truth.name}")
+    finally:
+        print(evaluation.table(report))
+
+
+@contextlib.contextmanager
+def _training_packages() -> Iterator[None]:
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f"this needs the Python package '{error.name}': pip install 'paul_ros[train]'") from error
+
+
 def _add_train(commands: argparse._SubParsersAction, wanted: bool) -> None:
     parser = commands.add_parser(
         "train",
@@ -254,6 +325,7 @@ def _parser(train: bool) -> argparse.ArgumentParser:
     _add_replay(commands)
     _add_inspect(commands)
     _add_train(commands, train)
+    _add_evaluate(commands)
     _add_demo(commands)
     _add_benchmark(commands)
     return parser
@@ -309,8 +381,9 @@ def _is_expected(error: Exception) -> bool:
     from paul_ros.skeleton import LayoutError
 
     expected: tuple = (BagError, DemoError, ImportError, LayoutError, ModelError, OSError, PictureError)
-    if "training.cli" in sys.modules:
-        expected += sys.modules["training.cli"].ERRORS
+    for module in ("training.cli", "training.evaluation"):
+        if module in sys.modules:
+            expected += sys.modules[module].ERRORS
     return isinstance(error, expected)
 
 

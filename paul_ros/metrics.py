@@ -29,6 +29,14 @@ def mpjpe(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return _mean_distance(_centred(predicted), _centred(truth))
 
 
+def mpjpe_flip_frame(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """MPJPE as in C3DPO (Novotny et al., ICCV 2019): mean depth removed, the better of original and depth-flipped.
+
+    x and y are centred too; where all points are seen a fitted prediction is already, and nothing changes.
+    """
+    return np.minimum(mpjpe(predicted, truth), mpjpe(flip_depth(predicted), truth))
+
+
 def n_mpjpe(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """MPJPE after the least-squares scale of every prediction (Rhodin et al., CVPR 2018); no flip."""
     predicted, truth = _centred(predicted), _centred(truth)
@@ -42,6 +50,17 @@ def pa_mpjpe(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     predicted, truth = _centred(predicted), _centred(truth)
     R, scale = procrustes(predicted, truth)
     return _mean_distance(scale[:, None, None] * np.einsum("nij,npj->npi", R, predicted), truth)
+
+
+def fill_absent(points: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Points (N,P,3) with the mean of a shape's present ones (N,P) in place of the others.
+
+    Done to prediction and truth alike, a point that the truth lacks counts for nothing: it moves no centre and has no
+    error. A mean over P points must then be divided by ``present.mean(1)``.
+    """
+    inside = present[..., None]
+    mean = np.where(inside, points, 0.0).sum(1, keepdims=True) / np.maximum(present.sum(1), 1)[:, None, None]
+    return np.where(inside, points, mean)
 
 
 def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,6 +79,20 @@ def normalised_error(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(predicted - truth, axis=(1, 2)) / np.linalg.norm(truth, axis=(1, 2))
 
 
+def normalised_error_o3(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Deep NRSfM's error (Kong and Lucey, ICCV 2019): NE after scaling to the truth's norm and O(3) alignment.
+
+    Reflections are allowed, so mirrored frames are forgiven, and so is every wrong camera: far milder than NE.
+    """
+    predicted, truth = _centred(predicted), _centred(truth)
+    size = np.linalg.norm(truth, axis=(1, 2), keepdims=True)
+    norm = np.linalg.norm(predicted, axis=(1, 2), keepdims=True)
+    predicted = predicted * size / np.maximum(norm, np.finfo(float).tiny)
+    U, _, Vt = np.linalg.svd(np.einsum("npi,npj->nij", truth, predicted))
+    aligned = np.einsum("nij,npj->npi", U @ Vt, predicted)
+    return np.linalg.norm(aligned - truth, axis=(1, 2)) / size[:, 0, 0]
+
+
 def normalised_error_flip_frame(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """NE, the depth of every single prediction flipped where that lowers its error."""
     return np.minimum(normalised_error(predicted, truth), normalised_error(flip_depth(predicted), truth))
@@ -69,3 +102,12 @@ def normalised_error_flip_global(predicted: np.ndarray, truth: np.ndarray) -> np
     """NE with one flip for the whole set, the one that gives the lower mean: mixed mirror signs show here."""
     plain, flipped = normalised_error(predicted, truth), normalised_error(flip_depth(predicted), truth)
     return plain if plain.mean() <= flipped.mean() else flipped
+
+
+def flipped_share(predicted: np.ndarray, truth: np.ndarray) -> float:
+    """Share of frames mirrored against the rest, 0 to 0.5: those whose depth must be flipped to lower their NE.
+
+    Which of the two mirror images a whole set is, is open under an orthographic camera; the rarer sign counts.
+    """
+    flipped = (normalised_error(flip_depth(predicted), truth) < normalised_error(predicted, truth)).mean()
+    return float(min(flipped, 1 - flipped))

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`paul evaluate`: errors whose value is known by construction, hidden points, scales, and clear refusals."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from paul_ros import cli, metrics
+from paul_ros.model import load_model, save_model
+from paul_ros.skeleton import load_layout
+from training import evaluation
+from training.data import DataError
+from training.truth import Sequence, load_sequence, random_rotations
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def turned(model_file, count=12, size=50.0, seed=0):
+    """The model's only shape in random poses, (F,3,P), in image units."""
+    return size * random_rotations(count, seed) @ load_model(model_file).mean_shape.astype(float)
+
+
+def write(path, S, **more):
+    np.savez(path, **{"W": S[:, :2], "S": S, **more})
+    return path
+
+
+def evaluate(model, data, tmp_path, *options):
+    assert cli.main(["evaluate", str(model), str(data), "--json", str(tmp_path / "e.json"), *options]) == 0
+    return json.loads((tmp_path / "e.json").read_text())
+
+
+# --- the measures
+
+
+def test_deep_nrsfms_error_forgives_what_it_says_and_nothing_else():
+    truth = np.random.default_rng(0).standard_normal((6, 9, 3))
+    similar = 3 * metrics.flip_depth(truth) @ random_rotations(6, 1).transpose(0, 2, 1) + 5
+    np.testing.assert_allclose(metrics.normalised_error_o3(similar, truth), 0, atol=1e-12)
+    stretched = truth * [1, 1, 2]
+    assert (metrics.normalised_error_o3(stretched, truth) > 0.05).all()
+    assert (metrics.normalised_error_o3(stretched, truth) < metrics.normalised_error(stretched, truth)).all()
+
+
+def test_mpjpe_takes_the_better_of_original_and_flipped():
+    truth = np.zeros((2, 4, 3))
+    truth[:, :, 2] = [3, -3, 3, -3]
+    mirrored = truth * [1, 1, -1]
+    np.testing.assert_allclose(metrics.mpjpe(mirrored, truth), 6)
+    np.testing.assert_allclose(metrics.mpjpe_flip_frame(mirrored + [0, 0, 9], truth), 0, atol=1e-12)
+    np.testing.assert_allclose(metrics.mpjpe_flip_frame(2 * truth, truth), 3)
+
+
+def test_flipped_share_counts_the_rarer_sign():
+    truth = np.random.default_rng(0).standard_normal((10, 5, 3))
+    mixed = truth.copy()
+    mixed[:7] = metrics.flip_depth(truth[:7])
+    assert metrics.flipped_share(mixed, truth) == metrics.flipped_share(truth, mixed) == pytest.approx(0.3)
+
+
+def test_absent_points_count_for_nothing():
+    truth = np.random.default_rng(0).standard_normal((3, 6, 3))
+    present = np.ones((3, 6), bool)
+    present[:, 5] = False
+    wild = truth.copy()
+    wild[:, 5] = 1e6
+    filled = (metrics.fill_absent(points, present) for points in (1.1 * wild, wild))
+    expected = metrics.normalised_error(1.1 * truth[:, :5], truth[:, :5])
+    np.testing.assert_allclose(metrics.normalised_error(*filled), expected)
+
+
+# --- single-frame prediction
+
+
+def test_a_perfect_model_has_no_error_and_the_observed_scale(model_file, tmp_path):
+    report = evaluate(model_file, write(tmp_path / "d.npz", turned(model_file) + 7), tmp_path)
+    assert report["ne_flip_frame_percent"] == pytest.approx(0, abs=1e-3)
+    assert report["mpjpe_flip_frame_units"] == pytest.approx(0, abs=1e-3)
+    assert report["reprojection_median_percent"] == pytest.approx(0, abs=1e-3)
+    assert report["certified_share"] == 1 and report["judged"] == report["frames"] == 12
+
+
+def test_errors_have_their_closed_form(model_file, tmp_path):
+    """Truth 10 % larger in depth alone than what the model can give: NE follows from the depths."""
+    S = turned(model_file)
+    truth = S.copy()
+    truth[:, 2] *= 1.1
+    report = evaluate(model_file, write(tmp_path / "d.npz", truth, W=S[:, :2]), tmp_path)
+    depth = np.linalg.norm(0.1 * S[:, 2], axis=1) / np.linalg.norm(truth, axis=(1, 2))
+    assert report["ne_flip_frame_percent"] == pytest.approx(100 * depth.mean(), rel=1e-3)
+    distance = np.abs(0.1 * S[:, 2]).mean()
+    assert report["mpjpe_flip_frame_units"] == pytest.approx(distance, rel=1e-3)
+    assert report["ne_o3_percent"] < report["ne_flip_frame_percent"]
+
+
+def test_distances_of_metric_truth_are_in_millimetres(model_file, tmp_path):
+    S = turned(model_file)
+    truth = S.copy()
+    truth[:, 2] *= 1.1
+    units = evaluate(model_file, write(tmp_path / "d.npz", truth, W=S[:, :2]), tmp_path)
+    metric = evaluate(model_file, write(tmp_path / "m.npz", truth, W=S[:, :2], metres=True), tmp_path)
+    assert units["n_mpjpe_mm"] is None and "n_mpjpe_units" not in metric
+    for name in ("mpjpe_flip_frame", "n_mpjpe", "pa_mpjpe"):
+        assert metric[f"{name}_mm"] == pytest.approx(1000 * units[f"{name}_units"])
+
+
+def test_hidden_points_count_and_are_told_apart(model_file, tmp_path):
+    S = turned(model_file)
+    visible = np.ones((12, 17), bool)
+    visible[:, 9] = False
+    truth = S.copy()
+    truth[:, 2, 9] += 20.0
+    report = evaluate(model_file, write(tmp_path / "d.npz", truth, visible=visible), tmp_path)
+    assert report["hidden_share"] == pytest.approx(1 / 17)
+    assert report["ne_hidden_percent"] > 3 * report["ne_visible_percent"] > 0
+    assert report["ne_visible_percent"] < report["ne_flip_frame_percent"] < report["ne_hidden_percent"]
+
+
+def test_what_a_hidden_point_holds_is_not_looked_at(model_file, tmp_path):
+    S = turned(model_file)
+    visible = np.random.default_rng(0).random((12, 17)) < 0.7
+    W = np.where(visible[:, None], S[:, :2], np.nan)
+    nan = evaluate(model_file, write(tmp_path / "n.npz", S, W=W), tmp_path)
+    wild = np.where(visible[:, None], S[:, :2], 1e5)
+    flagged = evaluate(model_file, write(tmp_path / "f.npz", S, W=wild, visible=visible), tmp_path)
+    assert nan["ne_flip_global_percent"] == flagged["ne_flip_global_percent"]
+
+
+def test_truth_that_is_not_known_counts_for_nothing(model_file, tmp_path):
+    S = turned(model_file)
+    truth = S.copy()
+    truth[:, 2, :] *= 1.1
+    truth[:, :, 4] = np.nan
+    report = evaluate(model_file, write(tmp_path / "d.npz", truth, W=S[:, :2]), tmp_path)
+    part = np.delete(S, 4, axis=2)
+    part = part - part.mean(2, keepdims=True)
+    expected = np.linalg.norm(0.1 * part[:, 2], axis=1) / np.linalg.norm(part * [[1], [1], [1.1]], axis=(1, 2))
+    assert report["ne_flip_frame_percent"] == pytest.approx(100 * expected.mean(), rel=1e-3)
+    assert report["mpjpe_flip_frame_units"] == pytest.approx(np.abs(0.1 * part[:, 2]).mean(), rel=1e-3)
+
+
+def test_mirror_image_of_unknown_chirality_is_forgiven_as_a_whole(model_file, tmp_path):
+    """The model's mirror image gives the same views; where its chirality is known, it is an error."""
+    S = turned(model_file)
+    data = write(tmp_path / "d.npz", S * [[1], [1], [-1]])
+    known = evaluate(model_file, data, tmp_path)
+    assert not known["whole_set_mirrored"] and known["pa_mpjpe_units"] > 1
+    model = load_model(model_file)
+    header = {**model.header, "chirality": {"known": False, "source": "made by hand"}}
+    save_model(tmp_path / "open.npz", header, {**model.weights, "mean_shape": model.mean_shape})
+    unknown = evaluate(tmp_path / "open.npz", data, tmp_path)
+    assert unknown["whole_set_mirrored"] and unknown["pa_mpjpe_units"] < 1e-3
+    assert unknown["flipped_share"] == 0 and unknown["ne_flip_global_percent"] < 1e-3
+
+
+def test_a_model_of_unit_scale_keeps_its_size(model_file, tmp_path):
+    """Seen twice as large as its size, it cannot follow; one of free scale can."""
+    free = load_model(model_file)
+    header = {**free.header, "scale": "unit", "image_unit": 50.0, "metres_per_unit": None}
+    save_model(tmp_path / "unit.npz", header, {**free.weights, "mean_shape": free.mean_shape})
+    data, twice = (write(tmp_path / f"{size}.npz", turned(model_file, size=size)) for size in (50.0, 100.0))
+    assert evaluate(tmp_path / "unit.npz", data, tmp_path)["ne_flip_frame_percent"] < 1e-3
+    assert evaluate(tmp_path / "unit.npz", twice, tmp_path)["ne_flip_frame_percent"] > 50
+    assert evaluate(model_file, twice, tmp_path)["ne_flip_frame_percent"] < 1e-3
+
+
+def test_the_baseline_is_the_rigid_mean_shape(model_file, tmp_path):
+    """Of a model that knows one shape only, both are the same."""
+    report = evaluate(model_file, write(tmp_path / "d.npz", turned(model_file) * [[1], [1], [1.2]]), tmp_path)
+    for key, value in report["baseline"].items():
+        assert report[key] == pytest.approx(value, rel=1e-6)
+    assert report["baseline"]["ne_flip_frame_percent"] > 1
+
+
+def test_frames_that_show_too_little_are_dropped_and_counted(model_file, tmp_path):
+    visible = np.ones((12, 17), bool)
+    visible[0, 3:] = False
+    report = evaluate(model_file, write(tmp_path / "d.npz", turned(model_file), visible=visible), tmp_path)
+    assert report["dropped"] == {"too_few_points": 1} and report["judged"] == 11
+
+
+FIXED = """frames persons dropped n_mpjpe_mm pa_mpjpe_mm ne_flip_frame_percent ne_flip_global_percent
+root_error_median_mm root_error_median_percent reprojection_median_px certified_share ambiguous_share
+lift_us_median lift_us_p99 baseline model bag versions""".split()
+
+
+def test_keys_of_the_json(model_file, tmp_path):
+    report = evaluate(model_file, write(tmp_path / "d.npz", turned(model_file)), tmp_path)
+    assert not set(FIXED) - set(report)
+    assert report["model"] == "stand" and report["lift_us_median"] > 0
+
+
+def test_table_and_picture(model_file, tmp_path, capsys):
+    edges = np.array(load_layout("coco17").edges)
+    data = write(tmp_path / "d.npz", turned(model_file), edges=edges)
+    evaluate(model_file, data, tmp_path, "--plot", str(tmp_path / "e.png"))
+    assert "one flip for all" in capsys.readouterr().out
+    assert (tmp_path / "e.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_model_is_judged_without_torch(model_file, tmp_path):
+    data = write(tmp_path / "d.npz", turned(model_file))
+    code = "import sys\nfrom paul_ros import cli\nassert cli.main(sys.argv[1:]) == 0\nassert 'torch' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code, "evaluate", model_file, data], cwd=ROOT, capture_output=True)
+    assert done.returncode == 0, done.stderr
+
+
+# --- bad input
+
+S = np.random.default_rng(0).standard_normal((4, 3, 17))
+BAD = {
+    "no truth": (dict(W=S[:, :2]), "no array S"),
+    "no W": (dict(S=S), "no array W"),
+    "other frames": (dict(W=S[:3, :2], S=S), "same frames"),
+    "other points": (dict(W=S[:, :2, :9], S=S[:, :, :9]), "9 points"),
+    "text": (dict(W=np.full((4, 2, 17), "a"), S=S), "numbers"),
+    "odd flags": (dict(W=S[:, :2], S=S, visible=np.full((4, 17), 7)), "visible"),
+    "edges of points that are not there": (dict(W=S[:, :2], S=S, edges=np.array([[0, 17]])), "edges"),
+    "truth of nothing": (dict(W=S[:, :2], S=S * np.nan), "holds no number"),
+    "nothing seen": (dict(W=S[:, :2], S=S, visible=np.zeros((4, 17))), "no frame"),
+    "pickled": (dict(W=np.array([{}]), S=S), "plain arrays"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_data_is_one_clear_line(model_file, tmp_path, capsys, case):
+    contents, message = BAD[case]
+    np.savez(tmp_path / "bad.npz", **contents)
+    assert cli.main(["evaluate", str(model_file), str(tmp_path / "bad.npz"), "--json", str(tmp_path / "e.json")]) == 1
+    printed = capsys.readouterr().err
+    assert message in printed and printed.count("\n") == 1
+    assert not (tmp_path / "e.json").exists()
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    (tmp_path / "bad.npz").write_bytes(b"PK junk")
+    with pytest.raises(DataError, match="bad.npz"):
+        load_sequence(tmp_path / "bad.npz")
+
+
+def test_help_has_examples(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["evaluate", "--help"])
+    assert end.value.code == 0 and "paul evaluate person.npz unseen.npz" in capsys.readouterr().out
+
+
+def test_data_or_truth_must_be_named(model_file, capsys):
+    for words in ([], ["a.npz", "--truth", "b.npz"]):
+        with pytest.raises(SystemExit) as end:
+            cli.main(["evaluate", str(model_file), *words])
+        assert end.value.code == 2 and "--truth" in capsys.readouterr().err
+
+
+# --- variants of a sequence
+
+
+def sequence(frames=30, points=20, seed=0):
+    S = np.random.default_rng(seed).standard_normal((frames, 3, points))
+    return Sequence("made", S[:, :2].copy(), np.ones((frames, points), bool), S, np.zeros((0, 2), int), False)
+
+
+def test_hiding_hides_that_share_of_every_frame_and_says_nothing_of_it():
+    hidden = sequence().hiding(0.3, seed=1)
+    assert (hidden.visible.sum(1) == 14).all() and (hidden.W.transpose(0, 2, 1)[~hidden.visible] == 0).all()
+    assert (hidden.visible.any(0)).all() and not np.array_equal(hidden.visible, sequence().hiding(0.3, 2).visible)
+    twice = hidden.hiding(0.5, seed=3)
+    assert (twice.visible.sum(1) == 7).all() and not (twice.visible & ~hidden.visible).any()
+
+
+def test_noise_is_a_share_of_the_rms_coordinate_and_leaves_the_truth():
+    made = sequence(400)
+    noisy = made.noisy(0.1, seed=0)
+    rms = np.sqrt(((made.W - made.W.mean(2, keepdims=True)) ** 2).mean())
+    assert (noisy.W - made.W).std() == pytest.approx(0.1 * rms, rel=0.02)
+    np.testing.assert_array_equal(noisy.S, made.S)
+
+
+def test_random_cameras_see_the_same_shapes():
+    made = sequence()
+    other = made.from_random_cameras(seed=0)
+    assert np.abs(other.W - made.W).max() > 0.1
+    np.testing.assert_array_equal(other.W, other.S[:, :2])
+    points, true = other.S.transpose(0, 2, 1), made.S.transpose(0, 2, 1)
+    np.testing.assert_allclose(metrics.pa_mpjpe(points, true), 0, atol=1e-12)
+    unknown = sequence()
+    unknown.S[0, 0, 0] = np.nan
+    with pytest.raises(DataError, match="not known"):
+        unknown.from_random_cameras(0)
+
+
+def test_mean_shape_of_one_shape_in_many_poses_is_that_shape():
+    shape = np.random.default_rng(0).standard_normal((3, 9))
+    mean = evaluation.rigid_mean(random_rotations(20, 0) @ shape * np.linspace(1, 3, 20)[:, None, None])
+    assert metrics.pa_mpjpe(mean.T[None], shape.T[None])[0] == pytest.approx(0, abs=1e-12)
+    assert np.sqrt((mean**2).sum(0).mean()) == pytest.approx(1)
