@@ -1,9 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training objective: reconstruction losses of both streams plus regularisers (the paper's equations 6-8).
+"""The training objective, term by term as in the paper (Wang and Lucey, CVPR 2021; equation numbers are its).
 
-Two streams decode a code phi = h(W, M): S_AD = f_d(phi) and S_AE = f_d(f_e(f_d(phi))).  Both have to match the
-observed points once the camera (the lower-level problem) is solved, and the unknown depth z - and all three
-coordinates of hidden points - is a free variable, whose optimum is the mean of the two streams.
+A code phi is decoded twice, by f_d(phi) and by f_d(f_e(f_d(phi))).  Equation 7, as the bilevel problem of equation 8:
+
+    min over networks: sum over frames of  min over R, z:  L_AE + L_AD + L_reg
+    L_AE = |f_d f_e f_d(phi) - R^T [W; z]|_F,   L_AD = |f_d(phi) - R^T [W; z]|_F                      (6, 7)
+    L_reg = 0.01 |phi|^2 + 1e-4 |theta_d|^2                                                           (12)
+
+The norms are unsquared and not divided by the number of points; sums over frames are means here.  The lower level, R
+and z, is solved by ``solver.py``: exactly, with its implicit gradients, or as the paper does (9, 10).
+
+**Hidden points** (section 4.3 and the supplement).  W is centred on its v visible points, so shapes have to be as well:
+
+    S~ = S - (1/v) S M 1 1^T        M = diag(visible)                                                 (11, 13)
+
+The printed equation 11, S + S (I - M) 1 1^T, lacks the 1/v: for a shape of zero mean S (I - M) 1 = -S M 1, so that
+with 1/v it is the line above, the shape less the mean of its visible points, and without it projections of S~ are not
+centred where W is.  The unknown part of the camera-frame shape is free (14): z of every point, x and y of hidden ones;
+the printed equation 14 writes 0 for the depth of visible points, where equation 4 has it free.  The best free
+values are the mean of both streams (10), so a hidden point costs what its two streams differ by (15).
+
+Beyond the paper, by weights of the recipe: a free scale of every frame, handedness, bones and perspective; and the
+nuclear norm of its baseline "ADL + low rank".
 """
 
 from __future__ import annotations
@@ -14,19 +32,23 @@ import torch
 from torch import Tensor
 
 from paul_ros.skeleton import Layout
+from training.distributed import WHOLE, Share
 from training.networks import Paul, edge_lengths
-from training.solver import centre, solve_camera
+from training.recipe import Recipe
+from training.solver import Camera, algebraic_camera, centre, solve_camera
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Loss terms of one batch, each a scalar mean over its frames."""
+    """The loss of a batch and its parts before they are weighted, each a scalar; 0 where a part has no weight."""
 
+    loss: Tensor
     recon_ae: Tensor
     recon_ad: Tensor
     code: Tensor
     handedness: Tensor
     bones: Tensor
+    nuclear: Tensor
 
 
 @dataclass(frozen=True)
@@ -34,7 +56,8 @@ class Views:
     """Image points of a batch as the networks see them, and how they lay in the image.
 
     Attributes:
-        W: (N,2,P) centred on the mean of the visible points, root mean square distance 1; 0 where hidden.
+        W: (N,2,P) centred on the mean of the visible points; 0 where hidden.  Of root mean square distance 1, or, where
+            all views have one scale, divided by one number.
         visible: (N,P) bool.
         centre, size: (N,2,1) and (N,1,1), ``size * W + centre`` are the image points before that.
         facing: (N,1,1), 1, or -1 where a view was mirrored: it shows the object from behind, so near and far change.
@@ -49,38 +72,130 @@ class Views:
     calibrated: bool
 
     @classmethod
-    def of(cls, image: Tensor, visible: Tensor, facing: Tensor, calibrated: bool) -> Views:
-        """Normalise image points (N,2,P); the torch twin of ``paul_ros.model.normalise``."""
+    def of(cls, image: Tensor, visible: Tensor, facing: Tensor, calibrated: bool, unit: float | None = None) -> Views:
+        """Normalise image points (N,2,P); the torch twin of ``paul_ros.model.normalise``.
+
+        Args:
+            unit: what all views are divided by, in units of the image; None: each by its own size.
+        """
         seen = visible[:, None].to(image.dtype)
         count = seen.sum(2, keepdim=True)
         middle = (image * seen).sum(2, keepdim=True) / count
         offset = (image - middle) * seen
-        size = (offset.square().sum((1, 2), keepdim=True) / count).sqrt().clamp_min(1e-9)
+        if unit is None:
+            size = (offset.square().sum((1, 2), keepdim=True) / count).sqrt().clamp_min(1e-9)
+        else:
+            size = torch.full_like(count, unit)
         return cls(offset / size, visible, middle, size, facing, calibrated)
 
+    def __getitem__(self, part: slice) -> Views:
+        """Some of the views."""
+        arrays = (self.W, self.visible, self.centre, self.size, self.facing)
+        return Views(*(array[part] for array in arrays), self.calibrated)
 
-def paul_terms(networks: Paul, layout: Layout, views: Views) -> Terms:
-    """Evaluate the objective on a batch."""
+
+@dataclass(frozen=True)
+class Fit:
+    """The lower level solved: what a batch's networks and best cameras make of its views.
+
+    Attributes:
+        code: (N,K) phi.
+        shape: (N,3,P) f_d(phi), canonical frame.
+        camera: R and scale.
+        ae, ad: (N,3,P) both streams in the camera frame, in units of W, centred on the visible points; ae is None where
+            the decoder's stream is trained alone.
+        points: (N,3,P) S_cam of equations 4 and 14: observed where it is, else the mean of the streams.
+    """
+
+    code: Tensor
+    shape: Tensor
+    camera: Camera
+    ae: Tensor | None
+    ad: Tensor
+    points: Tensor
+
+
+def fit(networks: Paul, recipe: Recipe, views: Views, rows: Tensor) -> Fit:
+    """Decode a batch and solve its cameras (equations 8-10); rows (N,) are the frames' numbers, for free codes."""
     W, visible = views.W, views.visible
-    code = networks.encoder(W, visible)
-    S_ad = networks.decoder(code)
-    S_ae = networks.decoder(networks.shape_encoder(S_ad))
-    S = (S_ad + S_ae) / 2
-    R, scale = solve_camera(S, W, visible)
+    code = networks.codes(W, visible, rows)
+    ad = networks.decoder(code)
+    streams = [ad] if recipe.streams == "decoder" else [networks.decoder(networks.shape_encoder(ad)), ad]
+    camera = _camera(streams, W, visible, recipe)
     if views.calibrated:
-        W = undo_perspective(views, scale * R[:, 2:] @ centre(S, visible))
-        R, scale = solve_camera(S, W, visible)
-    ae, ad = (scale * R @ centre(S, visible) for S in (S_ae, S_ad))
-    free = (ae + ad) / 2  # z*, and the whole of every hidden point
-    seen = visible[:, None] & torch.tensor([True, True, False], device=W.device)[:, None]
-    target = torch.where(seen, torch.cat([W, W[:, :1]], dim=1), free)
-    return Terms(
-        recon_ae=_distance(ae, target),
-        recon_ad=_distance(ad, target),
-        code=code.square().sum(1).mean(),
-        handedness=handedness_violation(S_ad, layout),
-        bones=bone_variation(S_ad, layout),
+        mean = centre(sum(streams) / len(streams), visible)
+        W = undo_perspective(views, camera.scale * camera.R[:, 2:] @ mean)
+        camera = _camera(streams, W, visible, recipe)
+    seen_streams = [camera.scale * camera.R @ centre(S, visible) for S in streams]
+    free = sum(seen_streams) / len(streams)  # z*, and the whole of every hidden point
+    known = visible[:, None] & torch.tensor([True, True, False], device=W.device)[:, None]
+    points = torch.where(known, torch.cat([W, W[:, :1]], dim=1), free)
+    return Fit(code, ad, camera, seen_streams[0] if len(streams) == 2 else None, seen_streams[-1], points)
+
+
+def _camera(streams: list[Tensor], W: Tensor, visible: Tensor, recipe: Recipe) -> Camera:
+    """The lower level's cameras.  Exactly: OnP of the streams' mean; algebraically: least squares of them all (9)."""
+    if recipe.solver == "exact":
+        return solve_camera(sum(streams) / len(streams), W, visible, recipe.scale)
+    shapes = torch.cat([centre(S, visible) for S in streams], dim=2)
+    times = len(streams)
+    return algebraic_camera(shapes, W.repeat(1, 1, times), visible.repeat(1, times), recipe.scale)
+
+
+def paul_terms(
+    networks: Paul, layout: Layout, recipe: Recipe, views: Views, rows: Tensor, share: Share = WHOLE
+) -> Terms:
+    """Evaluate the objective on a batch, or on this process's share of it: terms are always those of the batch."""
+    found = fit(networks, recipe, views, rows)
+    ae = None if found.ae is None else _distance(found.ae, found.points)
+    return _terms(networks, layout, recipe, found.code, found.shape, ae, _distance(found.ad, found.points), share)
+
+
+def regression_terms(
+    networks: Paul, layout: Layout, recipe: Recipe, views: Views, rows: Tensor, S: Tensor, share: Share = WHOLE
+) -> Terms:
+    """The same objective with known canonical shapes S (N,3,P) in place of R^T [W; z]: equation 3, supervised."""
+    code = networks.codes(views.W, views.visible, rows)
+    shape = networks.decoder(code)
+    ae = None
+    if recipe.streams == "both":
+        ae = _distance(networks.decoder(networks.shape_encoder(shape)), S)
+    return _terms(networks, layout, recipe, code, shape, ae, _distance(shape, S), share)
+
+
+def _terms(
+    networks: Paul,
+    layout: Layout,
+    recipe: Recipe,
+    code: Tensor,
+    shape: Tensor,
+    ae: Tensor | None,
+    ad: Tensor,
+    share: Share,
+) -> Terms:
+    """Weigh the distances (N,) of both streams and the regularisers of codes (N,K) and shapes (N,3,P)."""
+    ae = torch.zeros_like(ad) if ae is None else ae
+    recon_ae, recon_ad, size = share.whole(torch.stack([ae, ad, code.square().sum(1)], dim=1)).mean(0)
+    handedness = bones = nuclear = shape.new_zeros(())
+    if recipe.handedness_weight or recipe.bone_weight or recipe.nuclear_weight:
+        shape = share.whole(shape)
+    if recipe.handedness_weight:
+        handedness = handedness_violation(shape, layout)
+    if recipe.bone_weight:
+        bones = bone_variation(shape, layout)
+    if recipe.nuclear_weight:
+        nuclear = torch.linalg.matrix_norm(shape.flatten(1), "nuc")
+    decay = sum(weight.square().sum() for weight in networks.decoder.parameters())
+    loss = (
+        recon_ae
+        + recon_ad
+        + recipe.code_weight * size
+        + recipe.decay_weight * decay
+        + recipe.nuclear_weight * nuclear
+        # Frobenius norms grow with the square root of the number of points; these two do not.
+        + shape.shape[2] ** 0.5 * (recipe.handedness_weight * handedness + recipe.bone_weight * bones)
     )
+    return Terms(loss, recon_ae, recon_ad, size, handedness, bones, nuclear)
 
 
 @torch.no_grad()
@@ -96,8 +211,8 @@ def undo_perspective(views: Views, depth: Tensor) -> Tensor:
 
 
 def _distance(X: Tensor, target: Tensor) -> Tensor:
-    """Mean over frames of the unsquared Frobenius distance, per point."""
-    return (X - target).square().sum((1, 2)).div(X.shape[2]).add(1e-8).sqrt().mean()
+    """Frobenius distances (N,), unsquared; the small constant keeps their gradient finite where nothing is left."""
+    return (X - target).square().sum((1, 2)).add(1e-8 * X.shape[2]).sqrt()
 
 
 def handedness_violation(S: Tensor, layout: Layout, margin: float = 0.5) -> Tensor:

@@ -19,12 +19,28 @@ class RecipeError(ValueError):
 
 
 #: Settings that are one of a few words.
-CHOICES = {"codes": ("encoder", "free"), "encoder": ("residual", "convolutional"), "scale": ("free", "unit")}
+CHOICES = {
+    "codes": ("encoder", "free"),
+    "encoder": ("residual", "convolutional"),
+    "scale": ("free", "unit"),
+    "solver": ("exact", "algebraic"),
+    "streams": ("both", "decoder"),
+    "start": ("random", "rigid", "linear"),
+}
+_POSITIVE = ("bottleneck", "width", "blocks", "learning_rate", "code_learning_rate", "restarts")
+_NOT_NEGATIVE = (
+    *("steps", "regression_steps", "batch", "patience", "roll"),
+    *("code_weight", "decay_weight", "nuclear_weight", "handedness_weight", "bone_weight"),
+)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Settings of a run. Where a default departs from the paper's, the comment says so."""
+    """Settings of a run. Where a default departs from the paper's, the comment says so.
+
+    Weights multiply the terms of ``objective.py``; those of terms beyond the paper are per square root of the number
+    of points, as the Frobenius norms of the streams grow with it.
+    """
 
     bottleneck: int = 8  # K; the paper: 4 for small or rigid objects, 8 for articulated ones
     hidden: tuple[int, ...] = (16, 32, 64, 128, 256)  # f_d from the code upwards; f_e is its reverse
@@ -33,12 +49,20 @@ class Recipe:
     scale: str = "free"  # every frame has its own; unit: orthographic views of one fixed scale, as NRSfM's benchmarks
     width: int = 256  # of the 2D encoder's residual blocks
     blocks: int = 2
-    steps: int = 20_000
-    batch: int = 256
-    learning_rate: float = 1e-3  # Adam, warmed up over 200 steps, then a cosine to zero
+    streams: str = "both"  # f_d(phi) and f_d f_e f_d(phi); decoder: the first alone, the paper's baseline ADL
+    solver: str = "exact"  # of the cameras: the global optimum; algebraic: the paper's least squares and projection
+    start: str = "random"  # weights, as in the paper; rigid or linear: shapes that the networks first learn to give
+    regression_steps: int = 0  # that they learn them for
+    steps: int = 20_000  # of the objective; 0: the shapes of the start are the result
+    batch: int = 256  # 0: all frames at every step
+    learning_rate: float = 1e-3  # Adam, warmed up over 200 steps, then a cosine to zero, in either phase
+    code_learning_rate: float = 1e-2  # of free codes, which each frame has to itself
+    patience: int = 0  # stop when so many steps lowered the mean loss by less than 0.1 %; 0: go through
     seed: int = 0
-    code_weight: float = 1e-3  # the paper: 0.01
+    restarts: int = 1  # runs from this seed on; the one with the lowest final loss is kept
+    code_weight: float = 4.1231e-3  # the paper: 0.01
     decay_weight: float = 0.0  # of |theta_d|^2; the paper: 1e-4
+    nuclear_weight: float = 0.0  # of the nuclear norm of a batch's shapes; the paper's ADL + low rank: 0.01
     handedness_weight: float = 1.0  # beyond the paper: keeps frames from settling on mirrored shapes
     bone_weight: float = 1.0  # beyond the paper: edges of the layout keep their lengths
     roll: float = 0.3  # radians; in-plane turns of W, an exact augmentation under an orthographic camera
@@ -53,6 +77,8 @@ class Recipe:
     @classmethod
     def load(cls, name_or_path: str | Path, overrides: list[str] = ()) -> Recipe:
         """Read a shipped recipe by name or any YAML file, then apply ``key=value`` overrides.
+
+        A file may name a shipped recipe as its ``base``, whose settings it then changes.
 
         Raises:
             RecipeError: unknown file, key or value.
@@ -77,14 +103,24 @@ class Recipe:
     def __post_init__(self) -> None:
         for name, known in CHOICES.items():
             self._need(name, getattr(self, name) in known, f"one of {', '.join(known)}")
-        for name in ("bottleneck", "width", "blocks", "steps", "batch", "learning_rate"):
+        for name in _POSITIVE:
             self._need(name, getattr(self, name) > 0, "positive")
-        for name in ("code_weight", "decay_weight", "handedness_weight", "bone_weight", "roll"):
+        for name in _NOT_NEGATIVE:
             self._need(name, getattr(self, name) >= 0, "at least 0")
         self._need("hidden", self.hidden and all(type(size) is int and size > 0 for size in self.hidden), "layer sizes")
         shares = [share for share in self.fade if type(share) in (int, float)]
         self._need("fade", len(shares) == len(self.fade) == 2 and 0 <= shares[0] <= shares[1], "two growing shares")
         self._need("hide", 0 <= self.hide < 1, "in [0, 1)")
+        self._check_together()
+
+    def _check_together(self) -> None:
+        """Refuse settings that are sound alone and not together."""
+        if self.codes == "free" and self.mirror_object:
+            raise RecipeError("mirror_object needs codes: encoder, for the mirrored object has another code")
+        if self.start == "random" and not self.steps:
+            raise RecipeError("with start: random and steps: 0 nothing is trained: choose start: linear, or some steps")
+        if self.start != "random" and self.steps and not self.regression_steps:
+            raise RecipeError(f"start: {self.start} needs regression_steps, or the networks never learn of it")
 
     def _need(self, name: str, holds: object, what: str) -> None:
         if not holds:
@@ -122,10 +158,15 @@ def _read(name_or_path: str | Path) -> dict:
     path = resources.files("training") / "recipes" / f"{text}.yaml" if text in recipe_names() else Path(text)
     if not path.is_file():
         raise RecipeError(f"no recipe '{text}': neither a file nor one of {', '.join(recipe_names())}")
-    settings = _parsed(path.read_bytes(), f"recipe '{text}'")
-    if settings is not None and not isinstance(settings, dict):
+    settings = _parsed(path.read_bytes(), f"recipe '{text}'") or {}
+    if not isinstance(settings, dict):
         raise RecipeError(f"recipe '{text}' must be settings as key: value")
-    return settings or {}
+    base = settings.pop("base", None)
+    if base is None:
+        return settings
+    if base == text or base not in recipe_names():
+        raise RecipeError(f"the base of recipe '{text}' must be another one of {', '.join(recipe_names())}")
+    return {**_read(base), **settings}
 
 
 def _parsed(text: str | bytes, what: str) -> object:

@@ -1,61 +1,120 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: minibatches of 2D frames in, a checkpoint and a log out; resumable to the bit."""
+"""The training loop: batches of 2D frames in, a checkpoint and a log out; resumable to the bit.
+
+A run has up to three parts: a start is found (``starting.py``), the networks learn to give its shapes, and then the
+paper's objective is minimised.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from paul_ros.files import write_atomically
-from paul_ros.model import min_visible, normalise
+from paul_ros.model import enough_visible
 from paul_ros.skeleton import Layout
+from training import starting
 from training.data import TrainingData
+from training.distributed import Share, from_first, is_first, processes, share_of
 from training.networks import Paul, build_networks
-from training.objective import Terms, Views, paul_terms
+from training.objective import Terms, Views, paul_terms, regression_terms
 from training.recipe import Recipe
+from training.starting import START_UNIT, Lesson, Progress, Start, StartError, kept_start
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
-LOG_COLUMNS = ("step", "seconds", "loss", "recon_ae", "recon_ad", "code", "handedness", "bones", "learning_rate")
+LOG_COLUMNS = (
+    *("step", "seconds", "loss", "recon_ae", "recon_ad", "code", "handedness", "bones", "nuclear"),
+    *("learning_rate", "phase"),
+)
+REGRESSION, UNSUPERVISED = "regression", "unsupervised"
 _LOG_EVERY = 100
 _CHECKPOINT_SECONDS = 30.0
 _WARM_UP_STEPS = 200
-_GRADIENT_LIMIT = 1.0
+_GRADIENT_LIMIT = 1.0  # per square root of the number of points, as the objective grows with it
+_SETTLED = 1e-3
 
 
 class TrainingError(RuntimeError):
     """Training cannot go on; the text says what to do."""
 
 
-class Trainer:
-    """One run: data, recipe and a folder for its checkpoint and log.
+class _Objective(nn.Module):
+    """The objective as a module: what DistributedDataParallel can wrap."""
 
-    The folder holds ``checkpoint.pt`` (tensors and plain values, read without unpickling objects) and ``log.csv``.
-    Interrupted and continued, a run gives the same weights to the bit as one that went through.
+    def __init__(self, networks: Paul, layout: Layout, recipe: Recipe) -> None:
+        super().__init__()
+        self.networks, self.layout, self.recipe = networks, layout, recipe
+
+    def forward(self, views: Views, rows: Tensor, goal: Tensor | None, share: Share) -> Terms:
+        if goal is None:
+            return paul_terms(self.networks, self.layout, self.recipe, views, rows, share)
+        return regression_terms(self.networks, self.layout, self.recipe, views, rows, goal, share)
+
+
+class Trainer:
+    """One run: data, recipe, and a folder for what it keeps.
+
+    The folder holds ``checkpoint.pt`` (tensors and plain values, read without unpickling objects), ``log.csv`` and, if
+    the recipe asks for one, ``start.npz``. Interrupted and continued, a run gives the same weights to the bit as one
+    that went through, on the same machine (on a GPU as far as torch's deterministic algorithms reach).
+
+    Started by ``torchrun``, every process has its Trainer; the first one alone touches the folder.
+
+    Attributes:
+        networks: on ``device``.
+        start: the start once ``prepare`` was called, of the chirality that the layout asks for; None for random ones.
+        step: steps done, of both phases.
+        seconds: that they took, with the search for the start.
+        rows: of the log.
     """
 
-    def __init__(self, data: TrainingData, recipe: Recipe, folder: Path) -> None:
-        self.data, self.recipe, self.folder = data, recipe, folder
+    def __init__(self, data: TrainingData, recipe: Recipe, folder: Path, device: torch.device | str = "cpu") -> None:
+        self.data, self.recipe, self.folder, self.device = data, recipe, folder, torch.device(device)
+        if processes() > len(data.W) or 0 < recipe.batch < processes():
+            raise TrainingError(f"{processes()} processes cannot share a batch of fewer frames: start fewer")
         self.generator = torch.Generator().manual_seed(recipe.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.seed)
-            self.networks = build_networks(data.layout, recipe, len(data.W))
-        self.optimizer = torch.optim.Adam(self.networks.parameters(), lr=recipe.learning_rate, fused=True)
+            self.networks = build_networks(data.layout, recipe, len(data.W)).to(self.device)
+        self.optimizer = self._optimizer()
+        self._objective: nn.Module = _Objective(self.networks, data.layout, recipe)
+        if processes() > 1:
+            self._objective = nn.parallel.DistributedDataParallel(self._objective)
+        self.start: Start | None = None
         self.step, self.seconds, self.rows = 0, 0.0, []
-        self._W = torch.from_numpy(data.W)
-        self._visible = torch.from_numpy(data.visible)
-        self._mirror = torch.tensor(data.layout.mirror)
+        self.stopped = False
+        self._window = [0, 0.0, math.inf]  # steps and losses since the last look at them, and the mean before it
+        self._W = torch.from_numpy(data.W).to(self.device)
+        self._visible = torch.from_numpy(data.visible).to(self.device)
+        self._mirror = torch.tensor(data.layout.mirror, device=self.device)
 
     @property
     def checkpoint(self) -> Path:
         """Where the run is kept."""
         return self.folder / CHECKPOINT
+
+    @property
+    def regression_steps(self) -> int:
+        """Steps before those of the objective."""
+        return self.recipe.regression_steps if self.recipe.start != "random" else 0
+
+    @property
+    def steps(self) -> int:
+        """Steps of both phases."""
+        return self.regression_steps + self.recipe.steps
+
+    @property
+    def finished(self) -> bool:
+        """Nothing is left to do: all steps are done, or patience was out."""
+        return self.stopped or self.step >= self.steps
 
     def resume(self) -> bool:
         """Continue from the folder's checkpoint; False where there is none.
@@ -63,15 +122,17 @@ class Trainer:
         Raises:
             TrainingError: the checkpoint is damaged, or belongs to other data or another recipe.
         """
-        if not self.checkpoint.exists():
+        data = from_first(lambda: self.checkpoint.read_bytes() if self.checkpoint.exists() else None, self.device)
+        if data is None:
             return False
         try:
-            state = torch.load(self.checkpoint, weights_only=True)
+            state = torch.load(io.BytesIO(data), map_location=self.device, weights_only=True)
             self._check_identity(state["identity"])
             self.networks.load_state_dict(state["networks"])
             self.optimizer.load_state_dict(state["optimizer"])
-            self.generator.set_state(state["generator"])
+            self.generator.set_state(state["generator"].cpu())
             self.step, self.seconds, self.rows = state["step"], state["seconds"], [tuple(row) for row in state["rows"]]
+            self.stopped, self._window = state["stopped"], list(state["window"])
         except TrainingError:
             raise
         except Exception as error:  # torch reports damage in many ways
@@ -80,7 +141,30 @@ class Trainer:
             ) from error
         return True
 
-    def run(self) -> Iterator[dict[str, float]]:
+    def prepare(self, progress: Progress | None = None) -> None:
+        """Find the recipe's start, or read the one that the folder keeps.
+
+        Raises:
+            TrainingError: the folder's start is damaged, or belongs to other data or another recipe.
+        """
+        if self.recipe.start == "random" or self.start is not None:
+            return
+        identity = {
+            "data": self.data.sha256,
+            **{name: getattr(self.recipe, name) for name in ("start", "scale", "seed")},
+        }
+        try:
+            start = kept_start(self.folder, identity, lambda: self._search(progress), self.device)
+        except StartError as error:
+            raise TrainingError(str(error)) from error
+        share = rule_share(start.shapes, self.data.layout)
+        self.start = starting.mirrored(start) if share is not None and share < 0.5 else start
+        if self.step == 0:
+            self.seconds = start.seconds
+        if self.regression_steps:
+            self._lesson = Lesson(self.start, self.data.layout, self.recipe.scale, self.device)
+
+    def run(self) -> Iterator[dict[str, float | str]]:
         """Train to the recipe's last step, yielding the log row of every step's progress.
 
         A checkpoint is written now and then, at the end, and when the caller stops iterating.
@@ -88,9 +172,10 @@ class Trainer:
         Raises:
             TrainingError: the loss became infinite or NaN.
         """
+        self.prepare()
         saved, begun = time.monotonic(), time.monotonic() - self.seconds
         try:
-            while self.step < self.recipe.steps:
+            while not self.finished:
                 row = self._advance(begun)
                 if time.monotonic() - saved > _CHECKPOINT_SECONDS:
                     self.save()
@@ -101,6 +186,8 @@ class Trainer:
 
     def save(self) -> None:
         """Write checkpoint and log, each atomically."""
+        if not is_first():
+            return
         buffer = io.BytesIO()
         torch.save(
             {
@@ -111,6 +198,8 @@ class Trainer:
                 "generator": self.generator.get_state(),
                 "seconds": self.seconds,
                 "rows": [list(row) for row in self.rows],
+                "stopped": self.stopped,
+                "window": self._window,
             },
             buffer,
         )
@@ -119,62 +208,112 @@ class Trainer:
         csv.writer(log).writerows([LOG_COLUMNS, *self.rows])
         write_atomically(self.folder / LOG, log.getvalue().encode())
 
-    def _advance(self, begun: float) -> dict[str, float]:
+    def views(self, rows: Tensor) -> Views:
+        """Frames by their numbers (N,), as they are."""
+        rows = rows.to(self.device)
+        facing = torch.ones(len(rows), 1, 1, device=self.device)
+        return self._seen(self._W[rows], self._visible[rows], facing)
+
+    def _seen(self, image: Tensor, visible: Tensor, facing: Tensor) -> Views:
+        perspective = self.data.calibrated and self.recipe.perspective and self.recipe.scale == "free"
+        unit = self.data.image_unit if self.recipe.scale == "unit" else None
+        return Views.of(image, visible, facing, perspective, unit)
+
+    def _search(self, progress: Progress | None) -> Start:
+        views = self.views(torch.arange(len(self.data.W)))
+        W, visible = views.W.cpu().numpy() / START_UNIT[self.recipe.scale], views.visible.cpu().numpy()
+        return starting.search(self.recipe.start, W, visible, self.recipe.seed, progress)
+
+    def _optimizer(self) -> torch.optim.Optimizer:
+        """Adam on what this recipe trains, free codes at a rate of their own."""
+        codes = [] if self.networks.free_codes is None else list(self.networks.free_codes.parameters())
+        idle = [self.networks.encoder] if codes else []
+        idle += [self.networks.shape_encoder] if self.recipe.streams == "decoder" else []
+        for part in idle:
+            part.requires_grad_(False)
+        weights = [w for w in self.networks.parameters() if w.requires_grad and not any(w is code for code in codes)]
+        groups = [{"params": weights, "peak": self.recipe.learning_rate}]
+        if codes:
+            groups.append({"params": codes, "peak": self.recipe.code_learning_rate})
+        return torch.optim.Adam(groups, lr=self.recipe.learning_rate, fused=True)
+
+    def _advance(self, begun: float) -> dict[str, float | str]:
         """One optimisation step."""
-        rate = self._learning_rate()
+        phase = REGRESSION if self.step < self.regression_steps else UNSUPERVISED
+        factor = self._rate_factor()
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
-        terms = paul_terms(self.networks, self.data.layout, self._batch())
-        loss = self._loss(terms)
-        if not torch.isfinite(loss):
+            group["lr"] = group["peak"] * factor
+        terms = self._objective(*self._batch(phase))
+        loss = terms.loss.item()
+        if not math.isfinite(loss):
             raise TrainingError(
-                f"the loss is {loss.item()} at step {self.step}: lower learning_rate in the recipe, "
+                f"the loss is {loss} at step {self.step}: lower learning_rate in the recipe, "
                 f"and look for frames with wrong points in '{self.data.source}'"
             )
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.networks.parameters(), _GRADIENT_LIMIT)
+        terms.loss.backward()
+        limit = _GRADIENT_LIMIT * self.data.W.shape[2] ** 0.5
+        torch.nn.utils.clip_grad_norm_(self.networks.parameters(), limit)
         self.optimizer.step()
         self.step += 1
         self.seconds = time.monotonic() - begun
-        values = (loss, terms.recon_ae, terms.recon_ad, terms.code, terms.handedness, terms.bones)
-        row = (self.step, round(self.seconds, 2), *(round(value.item(), 6) for value in values), round(rate, 8))
-        if self.step % _LOG_EVERY == 0 or self.step == self.recipe.steps:
+        if phase == UNSUPERVISED and self.recipe.patience:
+            self.stopped = self._settled(loss)
+        row = self._row(terms, self.recipe.learning_rate * factor, phase)
+        if self.step % _LOG_EVERY == 0 or self.step == self.regression_steps or self.finished:
             self.rows.append(row)
         return dict(zip(LOG_COLUMNS, row))
 
-    def _loss(self, terms: Terms) -> Tensor:
+    def _row(self, terms: Terms, rate: float, phase: str) -> tuple:
+        values = (getattr(terms, name) for name in LOG_COLUMNS[2:9])
+        losses = (round(value.item(), 6) for value in values)
+        return (self.step, round(self.seconds, 2), *losses, round(rate, 8), phase)
+
+    def _settled(self, loss: float) -> bool:
+        """Whether the last ``patience`` steps had a mean loss that is not lower by a thousandth than that before them.
+
+        Means of windows that do not overlap: single batches are noise.
+        """
+        count, total, before = self._window
+        count, total = count + 1, total + loss
+        if count < self.recipe.patience:
+            self._window = [count, total, before]
+            return False
+        self._window = [0, 0.0, total / count]
+        return total / count > (1 - _SETTLED) * before
+
+    def _rate_factor(self) -> float:
+        """Of all learning rates: a warm-up and a cosine to zero in either phase."""
+        first = self.step < self.regression_steps
+        step = self.step if first else self.step - self.regression_steps
+        steps = self.regression_steps if first else self.recipe.steps
+        warm_up = min(1.0, (step + 1) / _WARM_UP_STEPS)
+        return float(warm_up * 0.5 * (1 + np.cos(np.pi * step / steps)))
+
+    def _batch(self, phase: str) -> tuple[Views, Tensor, Tensor | None, Share]:
+        """This process's share of a batch: views, frame numbers, and in the first phase the shapes to be learned.
+
+        Every view is seen anew, turned, mirrored and with more points hidden. None of that changes the canonical shape,
+        but for a mirrored object, whose shape is mirrored as well.
+        """
         recipe = self.recipe
-        decay = sum(weight.square().sum() for weight in self.networks.decoder.parameters())
-        return (
-            terms.recon_ae
-            + terms.recon_ad
-            + recipe.code_weight * terms.code
-            + recipe.decay_weight * decay
-            + recipe.handedness_weight * terms.handedness
-            + recipe.bone_weight * terms.bones
-        )
-
-    def _learning_rate(self) -> float:
-        warm_up = min(1.0, (self.step + 1) / _WARM_UP_STEPS)
-        cosine = 0.5 * (1 + np.cos(np.pi * self.step / self.recipe.steps))
-        return float(self.recipe.learning_rate * warm_up * cosine)
-
-    def _batch(self) -> Views:
-        """Random frames, each seen anew: turned, mirrored and with more points hidden."""
-        recipe, size = self.recipe, self.recipe.batch
-        rows = torch.randint(len(self._W), (size,), generator=self.generator)
+        pool = len(self.data.W) if phase == UNSUPERVISED else len(self._lesson.rows)
+        size = recipe.batch or pool
+        chosen = torch.randint(pool, (size,), generator=self.generator) if recipe.batch else torch.arange(pool)
+        rows = (chosen if phase == UNSUPERVISED else self._lesson.rows[chosen]).to(self.device)
         W, visible = self._W[rows], self._visible[rows]
+        exchanged = None
         if recipe.mirror_object:
-            chosen = self._uniform(size) < 0.5
-            W = torch.where(chosen[:, None, None], W[:, :, self._mirror] * torch.tensor([-1.0, 1.0])[:, None], W)
-            visible = torch.where(chosen[:, None], visible[:, self._mirror], visible)
+            exchanged = (self._uniform(size) < 0.5)[:, None, None]
+            W = torch.where(exchanged, W[:, :, self._mirror] * torch.tensor([[-1.0], [1.0]], device=self.device), W)
+            visible = torch.where(exchanged[:, 0], visible[:, self._mirror], visible)
         if recipe.hide:
             fewer = visible & (self._uniform(size, visible.shape[1]) >= recipe.hide * self._uniform(size, 1))
-            enough = fewer.sum(1) >= min_visible(visible.shape[1])
-            visible = torch.where(enough[:, None], fewer, visible)
+            visible = torch.where(enough_visible(fewer, self.data.layout)[:, None], fewer, visible)
         turn, facing = self._turns(size)
-        return Views.of(turn @ W, visible, facing, self.data.calibrated and recipe.perspective)
+        share = share_of(size)
+        goal = None if phase == UNSUPERVISED else self._lesson.shapes_of(chosen, exchanged)[share.part]
+        return self._seen(turn @ W, visible, facing)[share.part], rows[share.part], goal, share
 
     def _turns(self, size: int) -> tuple[Tensor, Tensor]:
         """Random in-plane turns (N,2,2), half of them mirrored in x where the recipe says so; (N,1,1) is -1 for those.
@@ -193,19 +332,21 @@ class Trainer:
     def _strength(self) -> float:
         """Of the view augmentations: 1 before the fade, 0 after it."""
         begin, end = self.recipe.fade
-        done = self.step / self.recipe.steps
+        done = max(0, self.step - self.regression_steps) / max(1, self.recipe.steps)
         if done < begin:
             return 1.0
         return (end - done) / (end - begin) if done < end else 0.0
 
     def _uniform(self, *shape: int) -> Tensor:
-        return torch.rand(shape, generator=self.generator)
+        # On the CPU always, so that every device and every number of processes sees the same.
+        return torch.rand(shape, generator=self.generator).to(self.device)
 
     def _identity(self) -> dict[str, str]:
         """What a checkpoint belongs to."""
+        recipe = {key: value for key, value in self.recipe.to_dict().items() if key != "restarts"}
         return {
             "data": self.data.sha256,
-            "recipe": repr(sorted(self.recipe.to_dict().items())),
+            "recipe": repr(sorted(recipe.items())),
             "layout": repr(sorted(self.data.layout.to_dict().items(), key=lambda item: item[0])),
         }
 
@@ -218,12 +359,15 @@ class Trainer:
             )
 
 
-def predict_shapes(networks: Paul, data: TrainingData, limit: int = 20_000) -> np.ndarray:
-    """Canonical shapes (F,3,P) of up to ``limit`` evenly chosen training frames, from their 2D points."""
+@torch.no_grad()
+def predict_shapes(networks: Paul, data: TrainingData, limit: int = 4096) -> np.ndarray:
+    """Canonical shapes (F,3,P) of up to ``limit`` evenly chosen training frames, from their 2D points by h."""
     rows = np.linspace(0, len(data.W) - 1, min(limit, len(data.W))).astype(int)
-    W = torch.from_numpy(normalise(data.W[rows], data.visible[rows]).astype(np.float32))
-    with torch.no_grad():
-        return networks.decoder(networks.encoder(W, torch.from_numpy(data.visible[rows]))).double().numpy()
+    device = next(networks.parameters()).device
+    W, visible = torch.from_numpy(data.W[rows]).to(device), torch.from_numpy(data.visible[rows]).to(device)
+    unit = None if networks.decoder.unit_size else data.image_unit
+    views = Views.of(W, visible, torch.ones(len(rows), 1, 1, device=device), False, unit)
+    return networks.decoder(networks.encoder(views.W, visible)).double().cpu().numpy()
 
 
 def rule_share(shapes: np.ndarray, layout: Layout) -> float | None:

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The start of a run: 3D shapes that the networks first learn to give, found once and kept beside the checkpoint."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from paul_ros.files import write_atomically
+from paul_ros.metrics import procrustes
+from paul_ros.skeleton import Layout
+from training.distributed import from_first
+from training.networks import to_unit_size
+
+START = "start.npz"
+
+START_UNIT = {"free": 0.5**0.5, "unit": 1.0}
+"""Root mean square coordinate of ``Views.W`` by the recipe's scale: starts are searched for where it is 1."""
+
+Progress = Callable[[float], None]
+"""Is told the share of the work that is done, 0 to 1."""
+
+
+class StartError(RuntimeError):
+    """A start that cannot be used; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What ``warm_start.py`` found, as the trainer uses it.
+
+    Attributes:
+        rows: (n,) the frames that have a shape.
+        shapes: (n,3,P) float32 in one canonical frame: ``rotations @ shapes`` fits W at unit root mean square
+            coordinate.
+        rotations: (n,3,3) float32.
+        score: lower is better, comparable between seeds.
+        seconds: that the search took.
+    """
+
+    rows: np.ndarray
+    shapes: np.ndarray
+    rotations: np.ndarray
+    score: float
+    seconds: float
+
+
+def search(kind: str, W: np.ndarray, visible: np.ndarray, seed: int, progress: Progress | None) -> Start:
+    """Find a start from 2D alone; W (F,2,P) centred on the visible points, of root mean square coordinate 1."""
+    from training import warm_start
+
+    begun = time.monotonic()
+    find = {"linear": warm_start.linear_start, "rigid": warm_start.rigid_start}[kind]
+    found = find(W, visible, seed, progress)
+    return Start(
+        np.asarray(found.rows, np.int64),
+        np.asarray(found.shapes, np.float32),
+        np.asarray(found.rotations, np.float32),
+        float(found.score),
+        time.monotonic() - begun,
+    )
+
+
+def kept_start(folder: Path, identity: dict, find: Callable[[], Start], device: torch.device) -> Start:
+    """The start kept in a run's folder; if there is none, ``find`` one and keep it.
+
+    Args:
+        identity: what the start belongs to, plain JSON values.
+
+    Raises:
+        StartError: the file is damaged, or belongs to something else.
+    """
+    path = folder / START
+
+    def read_or_find() -> bytes:
+        if not path.exists():
+            write_atomically(path, _packed(find(), identity))
+        return path.read_bytes()
+
+    return _unpacked(from_first(read_or_find, device), identity, path)
+
+
+def _packed(start: Start, identity: dict) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, identity=np.array(json.dumps(identity, sort_keys=True)), **vars(start))
+    return buffer.getvalue()
+
+
+def _unpacked(data: bytes, identity: dict, path: Path) -> Start:
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            found = json.loads(str(archive["identity"]))
+            rows, shapes, rotations = archive["rows"], archive["shapes"], archive["rotations"]
+            start = Start(rows, shapes, rotations, float(archive["score"]), float(archive["seconds"]))
+    except Exception as error:  # numpy and zipfile report damage in a dozen ways
+        raise StartError(f"'{path}' cannot be read ({type(error).__name__}): start over with --fresh") from error
+    other = [name for name in identity if found.get(name) != identity[name]]
+    if other:
+        raise StartError(f"'{path}' belongs to another {' and '.join(other)}: start over with --fresh")
+    return start
+
+
+def mirrored(start: Start) -> Start:
+    """The same views explained by the mirror images: nothing in orthographic views tells which of them is right."""
+    flip = np.diag([1, 1, -1]).astype(np.float32)
+    return Start(start.rows, flip @ start.shapes, flip @ start.rotations @ flip, start.score, start.seconds)
+
+
+def symmetry(shapes: np.ndarray, layout: Layout) -> np.ndarray:
+    """The reflection (3,3) that best takes shapes (n,3,P) with left and right exchanged onto themselves on average."""
+    mean = shapes.mean(0, dtype=np.float64)
+    exchanged = np.diag([-1.0, 1.0, 1.0]) @ mean[:, layout.mirror]
+    R, _ = procrustes(exchanged.T[None], mean.T[None])
+    return (R[0] @ np.diag([-1.0, 1.0, 1.0])).astype(np.float32)
+
+
+class Lesson:
+    """Canonical shapes of a start that the networks learn to give."""
+
+    def __init__(self, start: Start, layout: Layout, scale: str, device: torch.device) -> None:
+        shapes = torch.from_numpy(start.shapes).to(device) * START_UNIT[scale]
+        shapes = shapes - shapes.mean(2, keepdim=True)
+        self._shapes = to_unit_size(shapes, layout) if scale == "free" else shapes
+        self._symmetry = torch.from_numpy(symmetry(start.shapes, layout)).to(device)
+        self._mirror = list(layout.mirror)
+        self.rows = torch.from_numpy(start.rows)
+
+    def shapes_of(self, chosen: Tensor, exchanged: Tensor | None) -> Tensor:
+        """Shapes (N,3,P) by their places in the start (N,), mirrored where left and right are exchanged (N,1,1)."""
+        S = self._shapes[chosen.to(self._shapes.device)]
+        return S if exchanged is None else torch.where(exchanged, self._symmetry @ S[:, :, self._mirror], S)
