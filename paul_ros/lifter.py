@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msg_adapters.keypoints import Intrinsics
-from paul_ros.model import Model
+from paul_ros.model import Model, ModelError, enough_visible
 from paul_ros.onp import OnP, onp
 from paul_ros.placement import centred_view, place, undo_perspective
 
@@ -69,6 +69,12 @@ class Lifter:
     """
 
     def __init__(self, model: Model) -> None:
+        """Raises ModelError: the model is of one fixed scale, which no camera's image has."""
+        if model.scale != "free":
+            raise ModelError(
+                f"model '{model.name}' is for orthographic data of one fixed scale: judge it with `paul evaluate`, "
+                f"or train a model to lift with by a recipe with scale: free"
+            )
         self.model = model
 
     def lift(self, xy: np.ndarray, visible: np.ndarray, camera: Intrinsics | None = None) -> Lifted:
@@ -84,7 +90,7 @@ class Lifter:
             ValueError: the arrays do not have these shapes.
         """
         xy, visible = self._checked(xy, visible)
-        reason = np.where(visible.sum(1) < self.model.min_visible, TOO_FEW_POINTS, "").astype(object)
+        reason = np.where(enough_visible(visible, self.model.layout), "", TOO_FEW_POINTS).astype(object)
         lifted = _nothing(len(xy), xy.shape[1], "m" if camera and self.model.metres_per_unit else "model")
         rows = np.flatnonzero(reason == "")
         if len(rows):
@@ -113,7 +119,7 @@ class Lifter:
         if camera is not None:
             # Once is enough: it leaves half a pixel and 5 mm of a person 2.5 m away, a tenth of that at 6 m.
             pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible)
-        enough = visible.sum(1) >= self.model.min_visible  # again: a virtual camera does not see all points
+        enough = enough_visible(visible, self.model.layout)  # again: a virtual camera does not see all points
         fixed = pose.determined & (pose.scale > 0) & (camera is None or _extent(xy, visible) >= MIN_EXTENT)
         points = self._placed(pose, S, fixed, turn if lifted["units"] == "m" else None)
         near = (np.abs(points) <= MAX_DISTANCE).all((1, 2)) if lifted["units"] == "m" else True

@@ -8,10 +8,12 @@ comment) are the SHA-256 of all bytes before them, so that any change to the fil
 from __future__ import annotations
 
 import difflib
+import functools
 import hashlib
 import io
 import json
 import math
+import operator
 import os
 import re
 import zipfile
@@ -26,8 +28,10 @@ from paul_ros.skeleton import Layout, LayoutError
 
 FORMAT_VERSION = 1
 DEFAULT_MODEL = "human_coco17"
+RESIDUAL, CONVOLUTIONAL = "residual", "convolutional"
+"""The kinds of 2D encoders."""
 _DIGEST_CHARS = 64
-_MAX_BYTES = 64 * 2**20
+_MAX_BYTES = 256 * 2**20
 _MAX_LAYERS = 100
 _MAX_WIDTH = 2**14
 
@@ -62,18 +66,47 @@ class Model:
         return self.header["metres_per_unit"]
 
     @property
+    def scale(self) -> str:
+        """``free``: every frame is normalised by its own size; ``unit``: orthographic data of one fixed scale."""
+        return self.header.get("scale", "free")
+
+    @property
     def min_visible(self) -> int:
         """Fewer visible points than this are not lifted: the shape would be mostly guessed."""
-        return min_visible(len(self.layout.names))
+        return min(min_visible(len(points)) for points in _parts(self.layout))
+
+    def normalise(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """Image points (N,2,P) as the encoder takes them: centred, in units of the frame's size or of the data's."""
+        if self.scale == "unit":
+            return centre(W, visible) / self.header["image_unit"]
+        return normalise(W, visible)
 
     def encode(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
-        """h(W, M): codes (N,K) of image points (N,2,P) in any unit and position; hidden ones are ignored."""
-        x = np.concatenate([normalise(W, visible).reshape(len(W), -1), visible], axis=1).astype(np.float32)
-        x = _relu(self._linear("encoder.input", x))
+        """h(W, M): codes (N,K) of image points (N,2,P), anywhere in the image; hidden ones are ignored.
+
+        They may be in any unit where ``scale`` is ``free``, else in that of the training data.
+        """
+        forward = (
+            self._convolutional if self.header["architecture"]["encoder"]["kind"] == CONVOLUTIONAL else self._residual
+        )
+        return forward(self.normalise(W, visible).astype(np.float32), np.asarray(visible, np.float32))
+
+    def _residual(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """The twin of ``training.networks.ResidualEncoder``."""
+        x = _relu(self._linear("encoder.input", np.concatenate([W.reshape(len(W), -1), visible], axis=1)))
         for block in range(self.header["architecture"]["encoder"]["blocks"]):
             inner = _relu(self._linear(f"encoder.blocks.{block}.first", x))
             x = x + _relu(self._linear(f"encoder.blocks.{block}.second", inner))
         return self._linear("encoder.output", x)
+
+    def _convolutional(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+        """The twin of ``training.networks.ConvolutionalEncoder``."""
+        dictionaries = 1 + self.header["architecture"]["encoder"]["blocks"]
+        x = (W @ self.weights["encoder.dictionaries.0"].T).reshape(len(W), 6, -1)
+        for layer in range(dictionaries):
+            x = x if layer == 0 else x @ self.weights[f"encoder.dictionaries.{layer}"].T
+            x = _relu(x - self.weights[f"encoder.thresholds.{layer}"])
+        return self._linear("encoder.output", np.concatenate([x.reshape(len(x), -1), visible], axis=1))
 
     def decode(self, code: np.ndarray) -> np.ndarray:
         """f_d(phi): canonical shapes (N,3,P) in model units of codes (N,K)."""
@@ -81,7 +114,8 @@ class Model:
         layers = len(self.header["architecture"]["decoder"]["hidden"])
         for layer in range(layers):
             x = _elu(self._linear(f"decoder.{layer}", x))
-        return to_unit_size(self._linear(f"decoder.{layers}", x).reshape(len(x), 3, -1), self.layout)
+        S = self._linear(f"decoder.{layers}", x).reshape(len(x), 3, -1)
+        return to_unit_size(S, self.layout) if self.scale == "free" else S - S.mean(2, keepdims=True)
 
     def shape(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """f_d(h(W, M)): canonical shapes (N,3,P) in model units of image points (N,2,P)."""
@@ -107,12 +141,32 @@ def min_visible(points: int) -> int:
     return min(points, max(4, math.ceil(0.3 * points)))
 
 
-def normalise(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Image points (N,2,P) about the mean of the visible ones, in units of their rms distance to it; hidden ones 0."""
+def _parts(layout: Layout) -> list[tuple[int, ...]]:
+    """Points of each of the layout's categories; all points where it is of one."""
+    return list(layout.categories.values()) or [tuple(range(len(layout.names)))]
+
+
+def enough_visible(visible: np.ndarray, layout: Layout) -> np.ndarray:
+    """Whether frames with visibility (N,P) show enough points to be lifted, (N,): of one category, where it has some.
+
+    Arrays and tensors alike.
+    """
+    enough = [visible[:, list(points)].sum(1) >= min_visible(len(points)) for points in _parts(layout)]
+    return functools.reduce(operator.or_, enough)
+
+
+def centre(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Image points (N,2,P) about the mean of the visible ones; hidden ones 0."""
     seen = visible[:, None, :]
     count = np.maximum(visible.sum(1), 1)[:, None, None]
     W = np.where(seen, W, 0.0)
-    W = np.where(seen, W - W.sum(2, keepdims=True) / count, 0.0)
+    return np.where(seen, W - W.sum(2, keepdims=True) / count, 0.0)
+
+
+def normalise(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Image points (N,2,P) about the mean of the visible ones, in units of their rms distance to it; hidden ones 0."""
+    count = np.maximum(visible.sum(1), 1)[:, None, None]
+    W = centre(W, visible)
     size = np.sqrt((W**2).sum((1, 2), keepdims=True) / count)
     return W / np.where(size > 0, size, 1.0)
 
@@ -208,27 +262,37 @@ def _read_arrays(data: bytes) -> dict[str, np.ndarray]:
 
 def weight_shapes(header: dict, points: int) -> dict[str, tuple[int, ...]]:
     """Shapes of all arrays that a model with this header and P points must hold."""
-    encoder, hidden, K = (
-        header["architecture"]["encoder"],
-        header["architecture"]["decoder"]["hidden"],
-        header["bottleneck"],
-    )
-    width = encoder["width"]
-    layers = {"encoder.input": (width, 3 * points), "encoder.output": (K, width)}
-    for block in range(encoder["blocks"]):
-        layers[f"encoder.blocks.{block}.first"] = layers[f"encoder.blocks.{block}.second"] = (width, width)
-    sizes = [K, *hidden, 3 * points]
+    encoder, K = header["architecture"]["encoder"], header["bottleneck"]
+    shapes: dict[str, tuple[int, ...]] = {"mean_shape": (3, points)}
+    layers = {}
+    if encoder["kind"] == CONVOLUTIONAL:
+        atoms = dictionary_sizes(encoder["width"], encoder["blocks"], K)
+        for layer, (size, before) in enumerate(zip(atoms, [points, *atoms])):
+            shapes[f"encoder.dictionaries.{layer}"] = (size if layer else 3 * size, before)
+            shapes[f"encoder.thresholds.{layer}"] = (size,)
+        layers["encoder.output"] = (K, 6 * atoms[-1] + points)
+    else:
+        width = encoder["width"]
+        layers |= {"encoder.input": (width, 3 * points), "encoder.output": (K, width)}
+        for block in range(encoder["blocks"]):
+            layers[f"encoder.blocks.{block}.first"] = layers[f"encoder.blocks.{block}.second"] = (width, width)
+    sizes = [K, *header["architecture"]["decoder"]["hidden"], 3 * points]
     for layer, (inputs, outputs) in enumerate(zip(sizes, sizes[1:])):
         layers[f"decoder.{layer}"] = (outputs, inputs)
-    shapes: dict[str, tuple[int, ...]] = {"mean_shape": (3, points)}
     for name, size in layers.items():
         shapes[f"{name}.weight"], shapes[f"{name}.bias"] = size, size[:1]
     return shapes
 
 
+def dictionary_sizes(width: int, blocks: int, bottleneck: int) -> list[int]:
+    """Atoms of a convolutional encoder's dictionaries: from the width down to the bottleneck in equal steps."""
+    return [round(width + (bottleneck - width) * layer / blocks) for layer in range(blocks + 1)]
+
+
 def _check(header: dict, layout: Layout, arrays: dict[str, np.ndarray]) -> None:
     """Raise ValueError, TypeError or KeyError where the header is not one or the arrays are not those it speaks of."""
     _check_metres(header["metres_per_unit"])
+    _check_scale(header)
     _check_architecture(header)
     expected = weight_shapes(header, len(layout.names))
     if odd := sorted(set(expected) ^ set(arrays)):
@@ -244,9 +308,17 @@ def _check_metres(metres: object) -> None:
         raise ValueError(f"metres_per_unit is {metres!r}")
 
 
+def _check_scale(header: dict) -> None:
+    scale, unit = header.get("scale", "free"), header.get("image_unit")
+    if scale not in ("free", "unit"):
+        raise ValueError(f"unknown scale {scale!r}")
+    if scale == "unit" and not (type(unit) in (int, float) and 1e-12 < unit < 1e12):
+        raise ValueError(f"image_unit is {unit!r}, a model of scale 'unit' needs it")
+
+
 def _check_architecture(header: dict) -> None:
     encoder, decoder = header["architecture"]["encoder"], header["architecture"]["decoder"]
-    if (encoder["kind"], decoder["kind"]) != ("residual", "mlp"):
+    if encoder["kind"] not in (RESIDUAL, CONVOLUTIONAL) or decoder["kind"] != "mlp":
         raise ValueError(f"unknown architecture {encoder['kind']!r}, {decoder['kind']!r}")
     sizes = [header["bottleneck"], encoder["width"], *decoder["hidden"]]
     if not all(type(size) is int and 0 < size <= _MAX_WIDTH for size in [*sizes, encoder["blocks"]]):

@@ -8,7 +8,7 @@ of two layouts that are only nearly the same place on the body have different na
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -22,7 +22,7 @@ MIN_MAPPED = 3
 _SHIPPED = resources.files("paul_ros") / "layouts"
 _MAX_BYTES = 1_000_000
 _MAX_POINTS = 20_000
-_KEYS = ("name", "description", "names", "edges", "left_right", "root", "derived", "handedness")
+_KEYS = ("name", "description", "names", "edges", "left_right", "root", "derived", "handedness", "categories")
 
 
 class LayoutError(ValueError):
@@ -52,6 +52,8 @@ class Layout:
     names: P names. edges: bones, as pairs of point indices. left_right: pairs of (left, right) indices.
     root: the indices whose mean is the root point. derived: name -> indices whose mean that point is.
     handedness: rules of anatomy; may be empty. description: what it is and where its order comes from.
+    categories: kinds of objects whose points lie side by side: name -> its points, of which alone a frame of that kind
+    has any; empty where all points are of one object.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Layout:
     derived: dict[str, tuple[int, ...]]
     handedness: tuple[Handedness, ...]
     description: str = ""
+    categories: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
     @classmethod
     def from_dict(cls, data: object) -> Layout:
@@ -73,7 +76,7 @@ class Layout:
 
     def to_dict(self) -> dict:
         """Plain lists and names, for JSON or YAML."""
-        return {
+        layout = {
             "name": self.name,
             "description": self.description,
             "names": list(self.names),
@@ -85,6 +88,9 @@ class Layout:
                 {part: self._named(points) for part, points in vars(rule).items()} for rule in self.handedness
             ],
         }
+        if self.categories:
+            layout["categories"] = {name: self._named(points) for name, points in self.categories.items()}
+        return layout
 
     @cached_property
     def mirror(self) -> np.ndarray:
@@ -186,6 +192,18 @@ def layout_names() -> tuple[str, ...]:
     return tuple(sorted(file.name[:-5] for file in _SHIPPED.iterdir() if file.name.endswith(".yaml")))
 
 
+def anonymous_layout(points: int, edges: tuple[tuple[int, int], ...] = ()) -> Layout:
+    """A layout for P points of which nothing is known but how they hang together: p00, p01, ...
+
+    Raises LayoutError: too few or too many points, or edges that join no two of them.
+    """
+    names = [f"p{point:0{max(2, len(str(points - 1)))}d}" for point in range(points)]
+    if any(not 0 <= point < points for edge in edges for point in edge):
+        raise LayoutError(f"edges must join points 0 to {points - 1}")
+    named = [[names[point] for point in edge] for edge in edges]
+    return Layout.from_dict({"name": f"points{points}", "names": names, "edges": named, "root": names})
+
+
 def load_layout(name_or_path: str | Path) -> Layout:
     """A shipped layout by name, or a user's own by the path of its YAML file.
 
@@ -255,6 +273,7 @@ def _parse(data: object) -> Layout:
         derived=derived,
         handedness=tuple(_rule(rule, index) for rule in _list(data.get("handedness", []), "handedness")),
         description=_text(data["description"], "description").strip() if data.get("description") else "",
+        categories=_categories(data.get("categories", {}), index),
     )
 
 
@@ -281,6 +300,16 @@ def _sides(value: object, index: dict[str, int]) -> tuple[tuple[int, int], ...]:
     if len(set(used)) < len(used):
         raise LayoutError("left_right has a point in two pairs")
     return pairs
+
+
+def _categories(value: object, index: dict[str, int]) -> dict[str, tuple[int, ...]]:
+    categories = {
+        _text(name, "a name in categories"): _points(points, f"category '{name}'", index)
+        for name, points in _mapping(value, "categories").items()
+    }
+    if categories and sorted(point for points in categories.values() for point in points) != list(range(len(index))):
+        raise LayoutError("categories must have every point once")
+    return categories
 
 
 def _rule(value: object, index: dict[str, int]) -> Handedness:

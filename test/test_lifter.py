@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Lifter and the placement: geometry that must hold whatever the model says, and what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.lifter import DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS, Lifter
-from paul_ros.model import load_model
+from paul_ros.model import ModelError, load_model
 from paul_ros.placement import centred_view
 
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)
@@ -22,6 +24,12 @@ def model():
 def rigid_lifter(model):
     """Its shape is known exactly, so that geometry can be checked exactly."""
     return Lifter(model.rigid())
+
+
+def test_models_of_one_fixed_scale_are_refused(model):
+    fixed = replace(model, header={**model.header, "scale": "unit", "image_unit": 1.0})
+    with pytest.raises(ModelError, match="one fixed scale.*paul evaluate"):
+        Lifter(fixed)
 
 
 def pinhole(points):

@@ -14,6 +14,8 @@ import pytest
 from paul_ros.model import (
     Model,
     ModelError,
+    centre,
+    enough_visible,
     load_model,
     model_names,
     normalise,
@@ -123,6 +125,51 @@ def test_absurd_architectures_are_refused_in_one_short_line(tmp_path, part, chan
     with pytest.raises(ModelError) as caught:
         save_model(tmp_path / "bad.npz", base, arrays())
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize("changes", [{"scale": "big"}, {"scale": None}, {"scale": ["free"]}, {"scale": "unit"}])
+def test_unknown_scales_are_not_saved(tmp_path, changes):
+    with pytest.raises(ModelError, match="scale"):
+        save_model(tmp_path / "bad.npz", header(**changes), arrays())
+
+
+@pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf"), "1", True, None])
+def test_absurd_image_units_are_not_saved(tmp_path, unit):
+    with pytest.raises(ModelError, match="image_unit"):
+        save_model(tmp_path / "bad.npz", header(scale="unit", image_unit=unit), arrays())
+
+
+def test_models_of_unit_scale_see_the_size_of_a_view_and_give_shapes_of_any(tmp_path, saved):
+    save_model(tmp_path / "unit.npz", header(scale="unit", image_unit=50.0), arrays())
+    unit, free = load_model(tmp_path / "unit.npz"), load_model(saved)
+    rng = np.random.default_rng(1)
+    W, visible = 50 * rng.standard_normal((4, 2, 17)), rng.random((4, 17)) < 0.7
+    np.testing.assert_allclose(50 * unit.normalise(W, visible), centre(W, visible))
+    np.testing.assert_allclose(unit.shape(W + 9, visible), unit.shape(W, visible), atol=1e-3)
+    np.testing.assert_allclose(unit.shape(W, visible).mean(2), 0, atol=1e-4)
+    assert np.abs(unit.encode(2 * W, visible) - unit.encode(W, visible)).max() > 0.1
+    code = rng.standard_normal((4, 3))
+    sizes = [np.linalg.norm(model.decode(code), axis=(1, 2)) for model in (unit, free)]
+    assert np.ptp(sizes[0] / sizes[1]) > 0.1
+
+
+def test_old_models_say_nothing_of_scale_and_are_free(saved):
+    assert load_model(saved).scale == "free" == load_model().scale
+
+
+def test_enough_is_counted_within_a_category():
+    layout = LAYOUT.from_dict(
+        {
+            "name": "two",
+            "names": [f"a{i}" for i in range(5)] + [f"b{i}" for i in range(60)],
+            "root": ["a0"],
+            "categories": {"a": [f"a{i}" for i in range(5)], "b": [f"b{i}" for i in range(60)]},
+        }
+    )
+    visible = np.zeros((5, 65), bool)
+    visible[0, :4] = visible[1, :3] = visible[2, 5:23] = visible[3, 5:22] = True
+    visible[4, 3:7] = True  # two of each
+    assert enough_visible(visible, layout).tolist() == [True, False, True, False, False]
 
 
 def test_other_npz_files_are_told_from_damaged_models(tmp_path):

@@ -13,7 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paul_ros.skeleton import Layout, LayoutError, layout_names, load_layout
+from paul_ros.skeleton import Layout, LayoutError, anonymous_layout, layout_names, load_layout
 
 POINTS = {
     "body25": 25,
@@ -320,3 +320,29 @@ def test_whatever_stands_under_a_key_a_layout_or_a_layout_error_comes_out(key: s
     except LayoutError:
         return
     assert Layout.from_dict(layout.to_dict()) == layout
+
+
+# --- anonymous layouts and categories
+
+
+def test_anonymous_layouts_round_trip_and_sort_by_name():
+    layout = anonymous_layout(120, ((0, 1), (118, 119)))
+    assert layout.names[:2] == ("p000", "p001") and sorted(layout.names) == list(layout.names)
+    assert layout.edges == ((0, 1), (118, 119)) and layout.root == tuple(range(120))
+    assert Layout.from_dict(layout.to_dict()) == layout
+
+
+@pytest.mark.parametrize("points, edges", [(2, ()), (5, ((0, 5),)), (5, ((-1, 2),)), (5, ((2, 2),)), (20_001, ())])
+def test_anonymous_layouts_of_no_points_or_wrong_edges_are_refused(points, edges):
+    with pytest.raises(LayoutError):
+        anonymous_layout(points, edges)
+
+
+def test_categories_round_trip_and_hold_every_point_once():
+    data = {"name": "two", "names": list("abcdef"), "root": "a", "categories": {"x": list("abc"), "y": list("def")}}
+    layout = Layout.from_dict(data)
+    assert layout.categories == {"x": (0, 1, 2), "y": (3, 4, 5)}
+    assert Layout.from_dict(layout.to_dict()) == layout
+    for wrong in ({"x": list("abc")}, {"x": list("abcd"), "y": list("def")}, {"x": ["z"]}, ["x"], {"x": []}):
+        with pytest.raises(LayoutError):
+            Layout.from_dict({**data, "categories": wrong})

@@ -7,22 +7,31 @@ Ground truth may lie in the same file; it is never opened here.
 from __future__ import annotations
 
 import hashlib
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 import msg_adapters
-from paul_ros.model import min_visible
+from paul_ros.model import centre, enough_visible, min_visible
 from paul_ros.parameters import DEFAULTS
 from paul_ros.placement import centred_view
-from paul_ros.skeleton import Layout
+from paul_ros.skeleton import Layout, LayoutError, anonymous_layout, load_layout
 
 ABSURD = 1e6
 """Coordinates beyond this are no pixels: they would only drown the rest in rounding error."""
 
 RAY_LIMIT = 20.0
 """No camera sees rays of x/z beyond this."""
+
+_USUAL = "coco17"
+"""Layout of 17 points, where none is named."""
+
+_BLOCK = 1024
+"""Frames that are looked at together: dense data is large, and a copy of it larger still."""
 
 
 class DataError(ValueError):
@@ -40,6 +49,7 @@ class TrainingData:
         calibrated: W are rays, (x/z, y/z) of a pinhole camera turned to the object; else pixels or any unit.
         source: file name, for provenance.
         left_out: frames that held fewer visible points than can be lifted.
+        notes: what is odd about the data and does not forbid training, a sentence each.
     """
 
     W: np.ndarray
@@ -48,18 +58,27 @@ class TrainingData:
     calibrated: bool
     source: str
     left_out: int
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def image_unit(self) -> float:
+        """Root mean square of the visible coordinates about their frame's mean: the unit of data of one fixed scale."""
+        squares = sum(
+            float((centre(self.W[rows], self.visible[rows]).astype(float) ** 2).sum()) for rows in _blocks(len(self.W))
+        )
+        return math.sqrt(squares / (2 * int(self.visible.sum())))
 
     @property
     def sha256(self) -> str:
         """Digest of the arrays: a checkpoint belongs to the data it began with."""
-        digest = hashlib.sha256(np.ascontiguousarray(self.W).tobytes())
+        digest = hashlib.sha256(np.ascontiguousarray(self.W))
         digest.update(np.packbits(self.visible).tobytes())
         return digest.hexdigest()
 
 
 def load_training_data(
     path: str | Path,
-    layout: Layout,
+    layout: Layout | None = None,
     topic: str | None = None,
     min_confidence: float = DEFAULTS["min_confidence"],
 ) -> TrainingData:
@@ -69,7 +88,8 @@ def load_training_data(
         path: an ``.npz`` with ``W`` (F,2,P) and optionally ``visible`` (F,P) (or NaN where hidden) and ``calibrated``
             (one bool: W are rays); or a bag (an ``.mcap`` or a rosbag2 folder) with one topic of 2D keypoints of any
             message type that has an adapter, calibrated where it holds a CameraInfo.
-        layout: what the points are.
+        layout: what the points are; None: coco17 for 17 points and for bags, else an anonymous one, with ``edges``
+            (E,2) of the npz where it has them.
         topic: which topic of a bag; needed only where it has several.
         min_confidence: keypoints of a bag with a lower one count as hidden, as in the node.
 
@@ -81,21 +101,23 @@ def load_training_data(
     if not path.exists():
         raise DataError(f"no data at '{path}'")
     if path.suffix == ".npz":
-        W, visible, calibrated = _read_npz(path, layout)
+        W, visible, calibrated, layout = _read_npz(path, layout)
     else:
+        layout = layout or load_layout(_USUAL)
         W, visible, calibrated = _read_bag(path, layout, topic, min_confidence)
     return _checked(W, visible, layout, calibrated, path)
 
 
-def _read_npz(path: Path, layout: Layout) -> tuple[np.ndarray, np.ndarray, bool]:
+def _read_npz(path: Path, layout: Layout | None) -> tuple[np.ndarray, np.ndarray, bool, Layout]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             if "W" not in archive.files:
                 raise DataError(f"'{path}' has no array W (F,2,P); it has {', '.join(archive.files) or 'none'}")
             W = archive["W"]
+            layout = layout or _guessed_layout(W, archive, path)
             visible = _flags(archive, "visible", path)
             calibrated = _flags(archive, "calibrated", path)
-    except DataError:
+    except (DataError, LayoutError):
         raise
     except Exception as error:  # numpy and zipfile report damage in a dozen ways
         raise DataError(f"'{path}' is no npz file of plain arrays ({type(error).__name__}: {error})") from error
@@ -105,10 +127,31 @@ def _read_npz(path: Path, layout: Layout) -> tuple[np.ndarray, np.ndarray, bool]
             f"{W.dtype} {W.shape}: name the right layout with --layout"
         )
     if visible is None:
-        visible = np.ones((len(W), W.shape[2]), bool)
+        visible = ~np.isnan(W).any(1)
     if visible.shape != (len(W), W.shape[2]):
         raise DataError(f"visible in '{path}' must be {(len(W), W.shape[2])} to go with W, it is {visible.shape}")
-    return W, visible, calibrated is not None and calibrated.size == 1 and bool(calibrated.all())
+    if wrong := int((visible & ~np.isfinite(W).all(1)).sum()):
+        raise DataError(
+            f"W in '{path}' is NaN or infinite at {wrong} of {visible.sum()} visible points: hide missing points "
+            f"in visible, or leave visible out and mark them by NaN"
+        )
+    return W, visible, calibrated is not None and calibrated.size == 1 and bool(calibrated.all()), layout
+
+
+def _guessed_layout(W: np.ndarray, archive: np.lib.npyio.NpzFile, path: Path) -> Layout:
+    """The layout of a file that comes without one, by its number of points."""
+    if W.ndim != 3 or W.shape[1] != 2 or W.dtype.kind not in "fiu":
+        raise DataError(f"W in '{path}' must be numbers (F,2,P), it is {W.dtype} {W.shape}")
+    usual = load_layout(_USUAL)
+    if W.shape[2] == len(usual.names):
+        return usual
+    edges = archive["edges"] if "edges" in archive.files else np.zeros((0, 2), int)
+    if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu":
+        raise DataError(f"edges in '{path}' must be whole numbers (E,2), they are {edges.dtype} {edges.shape}")
+    try:
+        return anonymous_layout(W.shape[2], tuple(map(tuple, edges.tolist())))
+    except LayoutError as error:
+        raise DataError(f"the points of '{path}' make no layout: {error}") from None
 
 
 def _flags(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> np.ndarray | None:
@@ -127,7 +170,8 @@ def _read_bag(
     frames, camera, refused = _bag_keypoints(path, layout, topic)
     if not frames:
         raise DataError(
-            f"'{path}' holds no 2D keypoints of layout '{layout.name}'{f' on topic {topic}' if topic else ''}{refused}"
+            f"'{path}' holds no 2D keypoints of layout '{layout.name}'{f' on topic {topic}' if topic else ''}"
+            f"{refused}; name the right layout with --layout"
         )
     if len(frames) > 1:
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
@@ -165,25 +209,68 @@ def _bag_keypoints(
 
 
 def _checked(W: np.ndarray, visible: np.ndarray, layout: Layout, calibrated: bool, path: Path) -> TrainingData:
+    limit = RAY_LIMIT if calibrated else ABSURD
     visible = visible & np.isfinite(W).all(1)
-    if np.abs(W.transpose(0, 2, 1)[visible]).max(initial=0) > (RAY_LIMIT if calibrated else ABSURD):
+    if any((np.abs(W[rows]).max(1) > limit)[visible[rows]].any() for rows in _blocks(len(W))):
         raise DataError(
-            f"'{path}' has image points beyond {RAY_LIMIT if calibrated else ABSURD:g}: no "
-            f"{'rays' if calibrated else 'pixels'}; mark missing points as hidden or NaN"
+            f"'{path}' has image points beyond {limit:g}: no {'rays' if calibrated else 'pixels'}; "
+            f"mark missing points as hidden or NaN"
         )
-    enough = (visible.sum(1) >= min_visible(len(layout.names))) & (_spread(W, visible) > 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # of hidden points
+        W = np.where(visible[:, None], W.astype(np.float32, copy=False), np.float32(0))
+    enough = enough_visible(visible, layout) & (_spread(W, visible) > 0)
     if not enough.any():
         raise DataError(
             f"none of the {len(W)} frames in '{path}' has {min_visible(len(layout.names))} visible points "
             f"at different places: nothing to train on"
         )
-    W = np.where(visible[:, None], W, 0).astype(np.float32)[enough]
-    return TrainingData(W, visible[enough], layout, calibrated, path.name, int((~enough).sum()))
+    if not enough.all():
+        W, visible = W[enough], visible[enough]
+    _check_motion(W, visible, path)
+    _check_twins(W, visible, layout, path)
+    return TrainingData(W, visible, layout, calibrated, path.name, int((~enough).sum()), _notes(visible, layout))
+
+
+def _check_motion(W: np.ndarray, visible: np.ndarray, path: Path) -> None:
+    """Refuse frames that are all the same: what does not turn shows no depth."""
+    first = W[0]
+    for rows in _blocks(len(W)):
+        both = (visible[rows] & visible[0])[:, None]
+        if (np.where(both, np.abs(W[rows] - first), 0) > 1e-6 * np.abs(first).max()).any():
+            return
+    raise DataError(f"the {len(W)} frames in '{path}' are all the same: depth shows only where something moves")
+
+
+def _check_twins(W: np.ndarray, visible: np.ndarray, layout: Layout, path: Path) -> None:
+    """Refuse points that are one and the same: columns copied by mistake, as a rule."""
+    seen: dict[bytes, int] = {}
+    for point, name in enumerate(layout.names):
+        column = hashlib.sha256(np.ascontiguousarray(W[:, :, point]))
+        column.update(np.ascontiguousarray(visible[:, point]))
+        twin = seen.setdefault(column.digest(), point)
+        if twin != point and visible[:, point].any():
+            raise DataError(
+                f"points {layout.names[twin]} and {name} of '{path}' are at one place in every frame: leave one out"
+            )
+
+
+def _notes(visible: np.ndarray, layout: Layout) -> tuple[str, ...]:
+    never = [name for name, seen in zip(layout.names, visible.any(0)) if not seen]
+    if not never:
+        return ()
+    more = f" and {len(never) - 5} more" if len(never) > 5 else ""
+    return (f"{', '.join(never[:5])}{more} of layout '{layout.name}' never visible: where they are is a guess",)
+
+
+def _blocks(frames: int) -> Iterator[slice]:
+    return (slice(begin, begin + _BLOCK) for begin in range(0, frames, _BLOCK))
 
 
 def _spread(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """Extent (F,) of the visible points."""
-    seen = visible[:, None]
-    with np.errstate(invalid="ignore"):
-        extent = np.where(seen, W, -np.inf).max(2) - np.where(seen, W, np.inf).min(2)
-    return np.nan_to_num(extent, neginf=0.0).max(1)
+    extent = np.zeros(len(W))
+    for rows in _blocks(len(W)):
+        seen = visible[rows, None]
+        reach = np.where(seen, W[rows], -np.inf).max(2) - np.where(seen, W[rows], np.inf).min(2)
+        extent[rows] = np.nan_to_num(reach, neginf=0.0).max(1)
+    return extent

@@ -31,10 +31,7 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
     header = {
         "layout": layout.to_dict(),
         **architecture(recipe),
-        "normalisation": {
-            "input": "centred on the mean of the visible points, root mean square distance 1",
-            "unit": "mean edge length" if layout.edges else "root mean square distance to the centre",
-        },
+        **_scale(trainer),
         "chirality": _chirality(shapes, layout, recipe.handedness_weight),
         "metres_per_unit": metres_per_unit(shapes, layout, recipe.known_lengths),
         "training": {
@@ -62,8 +59,28 @@ def architecture(recipe: Recipe) -> dict:
     return {
         "bottleneck": recipe.bottleneck,
         "architecture": {
-            "encoder": {"kind": "residual", "width": recipe.width, "blocks": recipe.blocks},
+            "encoder": {"kind": recipe.encoder, "width": recipe.width, "blocks": recipe.blocks},
             "decoder": {"kind": "mlp", "hidden": list(recipe.hidden)},
+        },
+    }
+
+
+def _scale(trainer: Trainer) -> dict:
+    """The part of the header that says what sizes mean: of the image points, and of the shapes."""
+    if trainer.recipe.scale == "unit":
+        return {
+            "scale": "unit",
+            "image_unit": trainer.data.image_unit,
+            "normalisation": {
+                "input": "centred on the mean of the visible points, divided by image_unit",
+                "unit": "image_unit, as the image's",
+            },
+        }
+    return {
+        "scale": "free",
+        "normalisation": {
+            "input": "centred on the mean of the visible points, root mean square distance 1",
+            "unit": "mean edge length" if trainer.data.layout.edges else "root mean square distance to the centre",
         },
     }
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from paul_ros.model import CONVOLUTIONAL, RESIDUAL, dictionary_sizes
 from paul_ros.skeleton import Layout
 from training.recipe import Recipe
 
@@ -28,8 +29,11 @@ class ResidualBlock(nn.Module):
         return x + F.relu(self.second(F.relu(self.first(x))))
 
 
-class PointEncoder(nn.Module):
-    """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K)."""
+class ResidualEncoder(nn.Module):
+    """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by residual blocks.
+
+    Martinez et al. have 2 blocks; 6 of width 1024 are the depth of C3DPO (Novotny et al., ICCV 2019).
+    """
 
     def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
         super().__init__()
@@ -42,6 +46,45 @@ class PointEncoder(nn.Module):
         for block in self.blocks:
             x = block(x)
         return self.output(x)
+
+
+class ConvolutionalEncoder(nn.Module):
+    """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by block-sparse coding.
+
+    The encoder of Deep NRSfM (Kong and Lucey, ICCV 2019).  An orthographic view of S = sum_k c_k D_k by a camera R is
+    W = sum_k (c_k R) D_k: what a dictionary finds in a frame are blocks of 3 x 2 numbers, and a dictionary of
+    dictionaries acts on all six numbers of a block alike.  As there, each layer is one iteration of ISTA from zero: a
+    product with the transposed dictionary (a convolution, of kernel 3 x 1 and then 1 x 1) and a threshold for each
+    atom, a block soft threshold relaxed to a ReLU; atoms grow fewer towards the bottleneck, in equal steps; the code is
+    linear in the last blocks.
+
+    Hidden points are masked as in Deep NRSfM++ (Wang et al., 3DV 2020): there D is centred on the visible points and
+    its hidden columns are left out, which for W centred on them, and zero where hidden, gives the same products.
+
+    Unlike there, the decoder does not share the dictionaries (f_d is PAUL's), the camera is not read off the blocks (it
+    is solved for), and the last layer is also told which points are visible.
+    """
+
+    def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
+        super().__init__()
+        atoms = dictionary_sizes(width, blocks, bottleneck)
+        sizes = [(3 * atoms[0], points), *zip(atoms[1:], atoms)]
+        self.dictionaries = nn.ParameterList(torch.empty(size) for size in sizes)
+        self.thresholds = nn.ParameterList(torch.zeros(size) for size in atoms)
+        for dictionary in self.dictionaries:
+            nn.init.kaiming_normal_(dictionary)
+        self.output = nn.Linear(6 * atoms[-1] + points, bottleneck)
+
+    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
+        first, *others = self.dictionaries
+        x = (W @ first.T).reshape(len(W), 6, -1)
+        x = F.relu(x - self.thresholds[0])
+        for dictionary, threshold in zip(others, self.thresholds[1:]):
+            x = F.relu(x @ dictionary.T - threshold)
+        return self.output(torch.cat([x.flatten(1), visible.to(W.dtype)], dim=1))
+
+
+ENCODERS = {RESIDUAL: ResidualEncoder, CONVOLUTIONAL: ConvolutionalEncoder}
 
 
 class ShapeDecoder(nn.ModuleList):
@@ -111,7 +154,7 @@ def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
         frames: number of training frames, for free codes.
     """
     points, K = len(layout.names), recipe.bottleneck
-    encoder = PointEncoder(points, K, recipe.width, recipe.blocks)
+    encoder = ENCODERS[recipe.encoder](points, K, recipe.width, recipe.blocks)
     decoder = ShapeDecoder(layout, K, recipe.hidden, unit_size=recipe.scale == "free")
     shape_encoder = ShapeEncoder(points, K, recipe.hidden)
     free_codes = None

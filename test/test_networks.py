@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The networks: both encoders against their definitions and their numpy twins, free codes, both kinds of scale."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from paul_ros.model import ModelError, check_size, dictionary_sizes, load_model, save_model, weight_shapes
+from paul_ros.skeleton import anonymous_layout, load_layout
+from training.export import architecture
+from training.networks import build_networks
+from training.recipe import Recipe
+
+COCO = load_layout("coco17")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+def networks(layout=COCO, frames=6, **changes):
+    recipe = Recipe.from_dict({"bottleneck": 3, "hidden": [5, 7], "width": 12, "blocks": 2, **changes})
+    return build_networks(layout, recipe, frames), recipe
+
+
+def views(points=17, frames=6, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.standard_normal((frames, 2, points)), rng.random((frames, points)) < 0.7
+
+
+def header(recipe, layout=COCO, **changes):
+    return {
+        "layout": layout.to_dict(),
+        **architecture(recipe),
+        "normalisation": {},
+        "chirality": {"known": False, "source": "none"},
+        "metres_per_unit": None,
+        "training": {},
+        **changes,
+    }
+
+
+def saved(path, paul, recipe, layout=COCO, **changes):
+    """The model file of untrained networks, loaded again."""
+    weights = {k: v.numpy() for k, v in paul.state_dict().items() if k.startswith(("encoder.", "decoder."))}
+    mean = np.ones((3, len(layout.names)), np.float32)
+    save_model(path, header(recipe, layout, **changes), {**weights, "mean_shape": mean})
+    return load_model(path)
+
+
+def shaken(paul):
+    """Thresholds and biases away from their zeros, so that leaving one out is seen."""
+    with torch.no_grad():
+        for weight in paul.parameters():
+            weight.add_(0.1 * torch.randn_like(weight))
+    return paul
+
+
+@pytest.mark.parametrize("encoder", ["residual", "convolutional"])
+@pytest.mark.parametrize("scale", ["free", "unit"])
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_numpy_runs_what_torch_trained(tmp_path, encoder, scale, blocks):
+    paul, recipe = networks(encoder=encoder, scale=scale, blocks=blocks)
+    model = saved(tmp_path / "m.npz", shaken(paul), recipe, scale=scale, image_unit=40.0)
+    W, visible = views()
+    x = torch.from_numpy(model.normalise(100 * W + 7, visible).astype(np.float32))
+    with torch.no_grad():
+        expected = paul.decoder(paul.encoder(x, torch.from_numpy(visible))).numpy()
+    np.testing.assert_allclose(model.shape(100 * W + 7, visible), expected, atol=1e-4)
+
+
+def test_a_convolutional_layer_is_the_transposed_dictionary_on_each_block():
+    """Written out as sums, for one frame: every 3 x 2 block, then the code."""
+    paul, _ = networks(encoder="convolutional", blocks=1)
+    encoder = shaken(paul).encoder
+    W, visible = views(frames=1)
+    W = np.where(visible[:, None], W, 0)
+    D, E = (dictionary.detach().double().numpy() for dictionary in encoder.dictionaries)
+    thresholds = [threshold.detach().double().numpy() for threshold in encoder.thresholds]
+    D = D.reshape(3, -1, 17)
+    blocks = np.zeros((D.shape[1], 3, 2))
+    for k in range(len(blocks)):
+        for i in range(3):
+            for j in range(2):
+                blocks[k, i, j] = max(0, (D[i, k] * W[0, j]).sum() - thresholds[0][k])
+    deeper = np.zeros((len(E), 3, 2))
+    for k in range(len(E)):
+        deeper[k] = np.maximum(0, np.tensordot(E[k], blocks, 1) - thresholds[1][k])
+    x = np.concatenate([deeper.transpose(2, 1, 0).ravel(), visible[0]])
+    code = encoder.output.weight.detach().double().numpy() @ x + encoder.output.bias.detach().double().numpy()
+    with torch.no_grad():
+        found = encoder(torch.from_numpy(W).float(), torch.from_numpy(visible)).numpy()
+    np.testing.assert_allclose(found[0], code, atol=1e-5)
+
+
+def test_masked_dictionaries_are_those_of_deep_nrsfm_plus_plus():
+    """Centred on the visible points and without the hidden columns, the first dictionary gives the same products."""
+    rng = np.random.default_rng(0)
+    W, visible = views()
+    W = np.where(visible[:, None], W, 0)
+    W = np.where(visible[:, None], W - W.sum(2, keepdims=True) / visible.sum(1)[:, None, None], 0)
+    D = rng.standard_normal((36, 17))
+    for w, seen in zip(W, visible):
+        centred = D[:, seen] - D[:, seen].mean(1, keepdims=True)
+        np.testing.assert_allclose(D @ w.T, centred @ w[:, seen].T, atol=1e-12)
+
+
+@pytest.mark.parametrize("encoder", ["residual", "convolutional"])
+def test_codes_depend_on_the_mask_alone_too(encoder):
+    paul, _ = networks(encoder=encoder)
+    W = torch.zeros(2, 2, 17)
+    visible = torch.ones(2, 17, dtype=torch.bool)
+    visible[1, 3] = False
+    codes = paul.codes(W, visible, torch.arange(2))
+    assert not torch.equal(codes[0], codes[1])
+
+
+def test_free_codes_are_looked_up_by_frame():
+    paul, _ = networks(codes="free", frames=9)
+    rows = torch.tensor([7, 2, 7])
+    codes = paul.codes(torch.randn(3, 2, 17), torch.ones(3, 17, dtype=torch.bool), rows)
+    assert torch.equal(codes, paul.free_codes.weight[rows])
+    codes.sum().backward()
+    assert paul.free_codes.weight.grad[[2, 7]].abs().min() > 0 and not paul.free_codes.weight.grad[[0, 8]].any()
+    assert paul.encoder.output.weight.grad is None
+
+
+def test_an_encoder_starts_with_the_same_weights_whether_codes_are_free_or_not():
+    first, _ = networks(codes="encoder")
+    torch.manual_seed(0)
+    second, _ = networks(codes="free")
+    for name, weight in first.state_dict().items():
+        assert torch.equal(weight, second.state_dict()[name])
+
+
+def test_shapes_of_unit_scale_keep_their_size_and_all_are_centred():
+    codes = torch.randn(5, 3)
+    own, _ = networks(scale="unit")
+    with torch.no_grad():
+        own.decoder[-1].weight.mul_(10)
+        S = own.decoder(codes)
+        own.decoder.unit_size = True
+        unit = own.decoder(codes)
+    assert (S.mean(2).abs() < 1e-5).all() and (unit.mean(2).abs() < 1e-5).all()
+    sizes = S.norm(dim=(1, 2)) / unit.norm(dim=(1, 2))
+    assert sizes.max() / sizes.min() > 1.05
+    torch.testing.assert_close(S / sizes[:, None, None], unit)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(1, 300), st.integers(1, 12), st.integers(1, 300))
+def test_dictionaries_go_from_the_width_to_the_bottleneck(width, blocks, bottleneck):
+    sizes = dictionary_sizes(width, blocks, bottleneck)
+    assert len(sizes) == blocks + 1 and sizes[0] == width and sizes[-1] == bottleneck
+    assert sizes == sorted(sizes, reverse=width > bottleneck)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.sampled_from(["residual", "convolutional"]), st.integers(3, 40), st.integers(1, 4), st.integers(1, 9))
+def test_the_header_foretells_every_weight(encoder, points, blocks, bottleneck):
+    layout = anonymous_layout(points)
+    paul, recipe = networks(layout, encoder=encoder, blocks=blocks, bottleneck=bottleneck)
+    expected = weight_shapes(header(recipe, layout), points)
+    found = {name: tuple(value.shape) for name, value in paul.state_dict().items()}
+    assert {**found, "mean_shape": (3, points)}.items() >= expected.items()
+    assert all(name in expected for name in found if name.startswith(("encoder.", "decoder.")))
+
+
+def test_the_depth_of_c3dpo_fits_a_model_file():
+    recipe = Recipe.from_dict({"width": 1024, "blocks": 6})
+    check_size(architecture(recipe), 91)
+    with pytest.raises(ModelError, match="MiB of weights"):
+        check_size(architecture(Recipe.from_dict({"width": 4096, "blocks": 6})), 91)
+
+
+def test_dense_models_fit_a_model_file():
+    check_size(architecture(Recipe()), 6890)
