@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""After free codes are trained: a 2D encoder h that gives them, so that the model also lifts what it never saw."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from training.trainer import Trainer
+
+STEPS = 3000
+_BATCH = 128
+_LEARNING_RATE = 1e-3
+
+
+def fit_encoder(trainer: Trainer, steps: int = STEPS) -> float:
+    """Train h by regression to the run's free codes; returns the mean distance that is left, in units of W.
+
+    Distances are of shapes, |f_d(h(W)) - f_d(phi)|, for codes have no scale of their own. Views are turned in their
+    plane by any angle and half of them mirrored: under an orthographic camera the code stays the same.
+    """
+    networks, device = trainer.networks, trainer.device
+    generator = torch.Generator().manual_seed(trainer.recipe.seed)
+    weights = [weight.requires_grad_(True) for weight in networks.encoder.parameters()]
+    adam = torch.optim.Adam(weights, _LEARNING_RATE, fused=True)
+    left = []
+    for step in range(steps):
+        adam.param_groups[0]["lr"] = _LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * step / steps))
+        rows = torch.randint(len(trainer.data.W), (_BATCH,), generator=generator).to(device)
+        angle = (2 * math.pi * torch.rand(_BATCH, generator=generator)).to(device)
+        facing = torch.where(torch.rand(_BATCH, generator=generator) < 0.5, -1.0, 1.0).to(device)
+        turn = torch.stack([angle.cos() * facing, -angle.sin(), angle.sin() * facing, angle.cos()], 1).view(-1, 2, 2)
+        views = trainer.views(rows)
+        with torch.no_grad():
+            goal = networks.decoder(networks.codes(views.W, views.visible, rows))
+        found = networks.decoder(networks.encoder(turn @ views.W, views.visible))
+        distance = (found - goal).square().sum((1, 2)).add(1e-8).sqrt().mean()
+        gradients = torch.autograd.grad(distance, weights)
+        for weight, gradient in zip(weights, gradients):
+            weight.grad = gradient
+        adam.step()
+        left.append(distance.detach())
+    return torch.stack(left[-100:]).mean().item()

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reconstruct the very frames that a model is trained on: 2D in, 3D shapes out (non-rigid structure from motion)."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from paul_ros.files import write_atomically
+from training.data import DataError, TrainingData
+from training.objective import Views, fit, paul_terms
+from training.recipe import Recipe
+from training.solver import centre
+from training.starting import START_UNIT, Progress
+from training.trainer import Trainer, TrainingError
+
+_BATCH = 256
+_START_SHARE = 0.3  # of the work, as progress tells it
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """3D shapes of all training frames, in their cameras' frames.
+
+    Attributes:
+        shapes: (F,3,P) float32, image units, centred on the visible points: x and y of visible points as observed, all
+            else the mean of the streams (S_cam of the paper and of its supplement, equation 14).
+        rotations: (F,3,3) float32, from the canonical to the camera frame.
+        codes: (F,K) float32; None where no networks were trained.
+        loss: of the objective over all frames as they are (or the score of the start, where no networks were trained);
+            comparable between seeds of one method, made without any ground truth.
+        seconds: of training, all restarts and the search for starts.
+    """
+
+    shapes: np.ndarray
+    rotations: np.ndarray
+    codes: np.ndarray | None
+    loss: float
+    seconds: float
+
+    def save(self, path: str | Path) -> None:
+        """Write an ``.npz`` of these arrays, atomically."""
+        arrays = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+        write_atomically(path, buffer.getvalue())
+
+
+def load_reconstruction(path: str | Path) -> Reconstruction:
+    """Read what ``Reconstruction.save`` wrote.
+
+    Raises:
+        DataError: there is no such file, or it holds something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        found = Reconstruction(
+            arrays["shapes"],
+            arrays["rotations"],
+            arrays.get("codes"),
+            float(arrays["loss"]),
+            float(arrays["seconds"]),
+        )
+    except Exception as error:  # numpy and zipfile report damage in a dozen ways
+        raise DataError(f"'{path}' is no saved reconstruction ({type(error).__name__}: {error})") from error
+    frames = len(found.shapes)
+    if found.shapes.ndim != 3 or found.shapes.shape[1] != 3 or found.rotations.shape != (frames, 3, 3):
+        raise DataError(f"'{path}' is no saved reconstruction: shapes are {found.shapes.shape}, not (F,3,P)")
+    return found
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run and its loss, as in ``Reconstruction``."""
+
+    trainer: Trainer
+    loss: float
+
+    @property
+    def seed(self) -> int:
+        """Of the run."""
+        return self.trainer.recipe.seed
+
+
+Watch = Callable[[Trainer], None]
+"""Trains to the end; shows progress or not."""
+
+
+def train_restarts(
+    data: TrainingData, recipe: Recipe, folder: Path, device: torch.device | str, watch: Watch
+) -> list[Run]:
+    """Train the recipe's restarts one after the other, each in a folder of its own; best first.
+
+    Raises:
+        TrainingError: see ``Trainer``.
+    """
+    runs = []
+    for one in restarts(recipe):
+        trainer = Trainer(data, one, run_folder(folder, recipe, one.seed), device)
+        trainer.resume()
+        watch(trainer)
+        runs.append(Run(trainer, final_loss(trainer)))
+    return sorted(runs, key=lambda run: run.loss)
+
+
+def restarts(recipe: Recipe) -> list[Recipe]:
+    """One recipe a restart: seeds count up from the recipe's."""
+    return [replace(recipe, seed=recipe.seed + number, restarts=1) for number in range(recipe.restarts)]
+
+
+def run_folder(folder: Path, recipe: Recipe, seed: int) -> Path:
+    """Where a restart is kept: the folder itself if it is the only one."""
+    return folder if recipe.restarts == 1 else folder / f"seed_{seed}"
+
+
+def reconstruct(
+    data: TrainingData, recipe: Recipe, folder: Path | None = None, progress: Progress | None = None
+) -> Reconstruction:
+    """Run the whole pipeline, restarts included, and reconstruct the data's frames by the run of the lowest loss.
+
+    Args:
+        folder: where runs are kept, and continued if they were interrupted; None keeps nothing.
+        progress: is told the share of the work that is done, 0 to 1.
+
+    Raises:
+        TrainingError: see ``Trainer``.
+    """
+    if folder is None:
+        with tempfile.TemporaryDirectory() as temporary:
+            return reconstruct(data, recipe, Path(temporary), progress)
+    finished = 0
+
+    def watch(trainer: Trainer) -> None:
+        nonlocal finished
+        tell = (lambda done: None) if progress is None else (lambda done: progress((finished + done) / recipe.restarts))
+        begin = 0.0 if recipe.start == "random" else _START_SHARE if recipe.steps else 1.0
+        trainer.prepare(lambda done: tell(begin * done))
+        for row in trainer.run():
+            tell(begin + (1 - begin) * row["step"] / trainer.steps)
+        finished += 1
+        tell(0.0)
+
+    runs = train_restarts(data, recipe, Path(folder), "cpu", watch)
+    return reconstruction_of(runs)
+
+
+@torch.no_grad()
+def reconstruction_of(runs: list[Run]) -> Reconstruction:
+    """What the first of the runs, the best, makes of its frames.
+
+    Raises:
+        TrainingError: no networks were trained and the start has not a shape for every frame.
+    """
+    trainer = runs[0].trainer
+    frames, points = len(trainer.data.W), trainer.data.W.shape[2]
+    shapes, rotations = np.empty((frames, 3, points), np.float32), np.empty((frames, 3, 3), np.float32)
+    codes = np.empty((frames, trainer.recipe.bottleneck), np.float32)
+    lift = _by_networks(trainer) if trainer.recipe.steps else _by_start(trainer)
+    for rows in _batches(frames):
+        views = trainer.views(rows)
+        inside, R, code = lift(rows, views)
+        seen = views.visible[:, None] & torch.tensor([True, True, False], device=trainer.device)[:, None]
+        inside = torch.where(seen, torch.cat([views.W, views.W[:, :1]], dim=1), centre(inside, views.visible))
+        shapes[rows], rotations[rows] = (views.size * inside).cpu().numpy(), R.cpu().numpy()
+        if code is not None:
+            codes[rows] = code.cpu().numpy()
+    seconds = sum(run.trainer.seconds for run in runs)
+    return Reconstruction(shapes, rotations, codes if trainer.recipe.steps else None, runs[0].loss, seconds)
+
+
+@torch.no_grad()
+def final_loss(trainer: Trainer) -> float:
+    """The objective's mean over all frames as they are, in fixed batches; the start's score if nothing was trained."""
+    if not trainer.recipe.steps:
+        trainer.prepare()
+        return trainer.start.score
+    recipe, total = trainer.recipe, 0.0
+    for rows in _batches(len(trainer.data.W)):
+        views, numbers = trainer.views(rows), rows.to(trainer.device)
+        terms = paul_terms(trainer.networks, trainer.data.layout, recipe, views, numbers)
+        total += len(rows) * terms.loss.item()
+    return total / len(trainer.data.W)
+
+
+def _batches(frames: int) -> Iterator[torch.Tensor]:
+    """Frame numbers in parts that fit into memory whatever the number of frames."""
+    return iter(torch.arange(frames).split(_BATCH))
+
+
+Lift = Callable[[Tensor, Views], tuple[Tensor, Tensor, Tensor | None]]
+"""Frames' numbers (N,) and views to shapes (N,3,P) in camera frame and units of W, rotations (N,3,3), codes (N,K)."""
+
+
+def _by_networks(trainer: Trainer) -> Lift:
+    def lift(rows: Tensor, views: Views) -> tuple[Tensor, Tensor, Tensor]:
+        found = fit(trainer.networks, trainer.recipe, views, rows.to(trainer.device))
+        return found.points, found.camera.R, found.code
+
+    return lift
+
+
+def _by_start(trainer: Trainer) -> Lift:
+    trainer.prepare()
+    start, frames = trainer.start, len(trainer.data.W)
+    place = np.full(frames, -1)
+    place[start.rows] = np.arange(len(start.rows))
+    if (place < 0).any():
+        raise TrainingError(
+            f"the start has shapes of {(place >= 0).sum()} of {frames} frames: give the recipe steps and "
+            f"regression_steps, so that networks reconstruct them all"
+        )
+
+    def lift(rows: Tensor, views: Views) -> tuple[Tensor, Tensor, None]:
+        R, S = (torch.from_numpy(array[place[rows]]).to(views.W) for array in (start.rotations, start.shapes))
+        return START_UNIT[trainer.recipe.scale] * R @ S, R, None
+
+    return lift
