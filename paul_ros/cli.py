@@ -174,6 +174,7 @@ def _add_benchmark(commands: argparse._SubParsersAction) -> None:
     )
     subjects = parser.add_subparsers(metavar="SUBJECT", required=True)
     _add_benchmark_onp(subjects)
+    _add_benchmark_nrsfm(subjects)
 
 
 def _add_benchmark_onp(subjects: argparse._SubParsersAction) -> None:
@@ -227,6 +228,102 @@ def _benchmark_onp(args: argparse.Namespace) -> None:
             write_picture(args.plot, report)
     finally:
         print(table(report))
+
+
+_NRSFM_EXAMPLES = """\
+Every npz file of the folder with W (F,2,P) and the truth S (F,3,P) in the camera frame is a sequence. The trainer is
+given W and visible, the frames shuffled by the seed; the truth judges what it reconstructed.
+
+methods: paul, adl (its decoder alone), adl_low_rank (and a nuclear norm), linear (the model that the search begins
+with), rigid; or the name or YAML file of a recipe of your own.
+
+Runs are kept in the work folder as they finish: the same command goes on where it was interrupted, and trains only
+what it has not yet. A run's folder depends on all that the run does.
+
+examples:
+  paul benchmark nrsfm --data nrsfm_short --json nrsfm.json --plot nrsfm.png
+  paul benchmark nrsfm --data nrsfm_short --sequences drink,yoga --methods paul,linear --seeds 20
+  paul benchmark nrsfm --data nrsfm_short --methods paul --hide 0.3 --set bottleneck=8
+"""
+
+
+def _add_benchmark_nrsfm(subjects: argparse._SubParsersAction) -> None:
+    parser = subjects.add_parser(
+        "nrsfm",
+        help="non-rigid structure from motion: the paper's table beside ours",
+        description="Reconstruct sequences by several methods and seeds; errors beside the published ones.",
+        epilog=_NRSFM_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--data", metavar="DIR", type=Path, required=True, help="folder of npz files")
+    parser.add_argument("--sequences", metavar="A,B", type=_names, help="file names without suffix (default: all)")
+    methods = "paul,adl,adl_low_rank,linear,rigid"
+    parser.add_argument("--methods", metavar="A,B", type=_names, default=methods, help="default: %(default)s")
+    parser.add_argument("--hide", metavar="SHARE", type=_share, default=0.0, help="of every frame's points, at random")
+    _add_runs(parser, Path("out/benchmark_nrsfm"))
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write all rows as JSON")
+    parser.add_argument("--plot", metavar="FILE.png", type=Path, help="draw all runs and the published figures")
+    parser.set_defaults(run=_benchmark_nrsfm)
+
+
+def _add_runs(parser: argparse.ArgumentParser, work: Path | None) -> None:
+    """Options of commands that train many times."""
+    parser.add_argument("--seeds", metavar="N", type=_positive, default=3, help="runs of each (default: %(default)s)")
+    if work:
+        parser.add_argument("--work", metavar="DIR", type=Path, default=work, help="keeps runs (default: %(default)s)")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="override a recipe's setting")
+    parser.add_argument("--fresh", action="store_true", help="train again what the work folder has")
+    parser.add_argument("--threads", metavar="N", type=_positive, default=1, help="CPU threads (default: %(default)s)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _keeping(args: argparse.Namespace, work: Path) -> object:
+    """How runs are done and kept."""
+    from training.experiments import Keeping
+
+    return Keeping(work, args.fresh, args.threads, args.quiet)
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"'{text}' is no list of different names, as in a,b")
+    return names
+
+
+def _share(text: str) -> float:
+    try:
+        share = float(text)
+    except ValueError:
+        share = -1.0
+    if not 0 <= share < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is no share from 0 to below 1")
+    return share
+
+
+def _benchmark_nrsfm(args: argparse.Namespace) -> None:
+    from paul_ros.bag import check_outputs
+    from paul_ros.report import write_json
+
+    check_outputs([args.json, args.plot], args.data.glob("*.npz"))
+    with _training_packages():
+        from training import benchmark
+    report = benchmark.run(
+        args.data,
+        sequences=args.sequences,
+        methods=args.methods,
+        seeds=args.seeds,
+        hide=args.hide,
+        settings=args.set,
+        keeping=_keeping(args, args.work),
+    )
+    try:
+        if args.json:
+            write_json(args.json, report)
+        if args.plot:
+            benchmark.write_picture(args.plot, report)
+    finally:
+        print(benchmark.table(report))
 
 
 _EVALUATE_EXAMPLES = """\
@@ -381,7 +478,7 @@ def _is_expected(error: Exception) -> bool:
     from paul_ros.skeleton import LayoutError
 
     expected: tuple = (BagError, DemoError, ImportError, LayoutError, ModelError, OSError, PictureError)
-    for module in ("training.cli", "training.evaluation"):
+    for module in ("training.cli", "training.evaluation", "training.experiments"):
         if module in sys.modules:
             expected += sys.modules[module].ERRORS
     return isinstance(error, expected)

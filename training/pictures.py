@@ -61,10 +61,13 @@ def titled(ax: Any, title: str) -> None:
 
 
 def legend_above(figure: Any, ax: Any) -> None:
-    """The legend of a panel's lines in a row above the figure."""
+    """The legend of a panel's lines in a row above the figure, each name once."""
     handles, names = ax.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 6), frameon=False, fontsize=10)
+    first = dict(zip(reversed(names), reversed(handles)))
+    names = list(dict.fromkeys(names))
+    if names:
+        place = dict(loc="outside upper center", ncols=min(len(names), 6), frameon=False, fontsize=10)
+        figure.legend([first[name] for name in names], names, **place)
 
 
 def percent_axis(ax: Any, label: str = "normalised error, %") -> None:

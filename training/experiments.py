@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many training runs in a row, for benchmark and studies: resumable, and judged by a truth that no run has seen.
+
+A run is given its frames in an order of its seed's own, and only where points were seen: W and visible. Its folder
+under the work folder is named by all that it depends on, so that an interrupted series goes on where it was and a
+changed setting begins anew. What is kept is the reconstruction; errors are computed whenever it is read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from paul_ros import metrics
+from paul_ros.model import enough_visible
+from paul_ros.skeleton import LayoutError, anonymous_layout
+from training import reconstruction
+from training.data import DataError, TrainingData, load_training_data
+from training.recipe import Recipe, RecipeError
+from training.reconstruction import Reconstruction
+from training.trainer import TrainingError
+from training.truth import Sequence
+
+ERRORS = (DataError, LayoutError, RecipeError, TrainingError)
+"""What a user can cause and mend; the text of each is one clear line."""
+
+RECIPES = {"paul": "nrsfm"}
+"""Recipes of methods whose name is not their recipe's."""
+
+BAD_BASIN = 3.0
+"""A run is in a bad basin where its NE, one flip for all, is above so many times the median of its method's runs."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run.
+
+    Attributes:
+        sequence: what is reconstructed, and the truth that judges it.
+        method: a name of RECIPES, or a recipe by name or file.
+        seed: of training and of the frames' order.
+        settings: overrides of the recipe, as ``--set`` takes them.
+        detail: what sets the run apart from others of its series, for people.
+    """
+
+    sequence: Sequence
+    method: str
+    seed: int
+    settings: tuple[str, ...] = ()
+    detail: str = ""
+
+    def recipe(self) -> Recipe:
+        """Its recipe; raises RecipeError. A recipe that trains several runs itself has seeds of its own in each."""
+        name = RECIPES.get(self.method, self.method)
+        restarts = Recipe.load(name, list(self.settings)).restarts
+        return Recipe.load(name, [*self.settings, f"seed={self.seed * restarts}"])
+
+    def order(self) -> np.ndarray:
+        """(F,) numbers of the frames in the order in which the trainer is given them."""
+        return np.random.default_rng([self.seed, 0]).permutation(len(self.sequence.W))
+
+    def folder(self, work: Path) -> Path:
+        """Where it is kept."""
+        digest = hashlib.sha256(repr(sorted(self.recipe().to_dict().items())).encode())
+        for array in (self.sequence.W.astype(np.float32), self.sequence.visible, self.order()):
+            digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        name = re.sub(r"[^\w.-]", "_", f"{self.sequence.name}_{Path(self.method).stem}_{self.seed}")
+        return work / f"{name}_{digest.hexdigest()[:10]}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run gave: errors in %, codes (F,K) in the order of the sequence's frames or None, loss and seconds."""
+
+    run: Run
+    ne_flip_frame_percent: float
+    ne_flip_global_percent: float
+    loss: float
+    seconds: float
+    codes: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """How runs are done and kept: a folder for them, whether to train all anew, CPU threads, no progress bar."""
+
+    work: Path
+    fresh: bool = False
+    threads: int = 1
+    quiet: bool = False
+
+
+def perform(runs: list[Run], keeping: Keeping) -> list[Outcome]:
+    """Train what is not there yet, one run after the other, and judge all.
+
+    Raises:
+        RecipeError: a recipe or a setting is none; before any training.
+        DataError: frames that cannot be trained on; before any training too.
+        TrainingError: a run failed.
+    """
+    for run in runs:
+        _check(run)
+    folders = [run.folder(keeping.work) for run in runs]
+    torch.set_num_threads(keeping.threads)
+    outcomes = []
+    # Into a log file, a line twice a minute.
+    interval = 0.1 if sys.stderr.isatty() else 30.0
+    layout = "{percentage:3.0f}%|{bar:20}| {n:.2f} of {total} runs [{elapsed}, {remaining} left] {desc}"
+    with tqdm(
+        total=len(runs), disable=keeping.quiet, bar_format=layout, mininterval=interval, dynamic_ncols=True
+    ) as bar:
+        for number, (run, folder) in enumerate(zip(runs, folders)):
+            detail = f" {run.detail}" if run.detail else ""
+            bar.set_description_str(f"{run.sequence.name} {Path(run.method).stem}{detail} seed {run.seed}")
+            outcomes.append(_perform(run, folder, keeping.fresh, lambda done: _move(bar, number + done)))
+            _move(bar, number + 1)
+    return outcomes
+
+
+def _check(run: Run) -> None:
+    """Refuse frames that the trainer would leave out: then shapes and truth were no longer of the same frames."""
+    enough = enough_visible(run.sequence.visible, anonymous_layout(run.sequence.W.shape[2]))
+    if not enough.all():
+        raise DataError(
+            f"{(~enough).sum()} of {len(enough)} frames of '{run.sequence.name}' show too few points to be "
+            "reconstructed: hide fewer points, or take these frames out of the file"
+        )
+
+
+def _move(bar: tqdm, to: float) -> None:
+    bar.update(max(0.0, to - bar.n))
+
+
+def _perform(run: Run, folder: Path, fresh: bool, progress: Callable[[float], None]) -> Outcome:
+    kept = folder / "shapes.npz"
+    if fresh:
+        shutil.rmtree(folder, ignore_errors=True)
+    if not kept.exists():
+        found = reconstruction.reconstruct(_given(run, folder), run.recipe(), folder / "run", progress)
+        found.save(kept)
+    return _judged(run, reconstruction.load_reconstruction(kept))
+
+
+def _given(run: Run, folder: Path) -> TrainingData:
+    """The trainer's data: through a file that holds what the trainer may know and nothing else."""
+    order, sequence = run.order(), run.sequence
+    path = folder / "given.npz"
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(path, W=sequence.W[order].astype(np.float32), visible=sequence.visible[order])
+    data = load_training_data(path, anonymous_layout(sequence.W.shape[2]))
+    if data.left_out:
+        raise DataError(
+            f"{data.left_out} of {len(order)} frames of '{sequence.name}' have all points in one place: "
+            "take them out of the file"
+        )
+    return data
+
+
+def _judged(run: Run, found: Reconstruction) -> Outcome:
+    """Errors of a reconstruction whose frames are in the run's order."""
+    order, sequence = run.order(), run.sequence
+    if found.shapes.shape != sequence.S.shape:
+        raise DataError(f"the kept run of '{sequence.name}' has shapes {found.shapes.shape}: start over with --fresh")
+    back = order.argsort()
+    known = sequence.present.sum(1) >= 2
+    present = sequence.present[known]
+    points, true = (metrics.fill_absent(S[known].transpose(0, 2, 1), present) for S in (found.shapes[back], sequence.S))
+    return Outcome(
+        run,
+        float(100 * metrics.normalised_error_flip_frame(points, true).mean()),
+        float(100 * metrics.normalised_error_flip_global(points, true).mean()),
+        float(found.loss),
+        float(found.seconds),
+        None if found.codes is None else found.codes[back],
+    )
+
+
+def chosen(outcomes: list[Outcome]) -> Outcome:
+    """The one with the lowest loss: what can be chosen without a truth. All of one method, sequence and setting."""
+    return min(outcomes, key=lambda outcome: (outcome.loss, outcome.run.seed))
+
+
+def groups(outcomes: list[Outcome], key: Callable[[Outcome], object]) -> dict:
+    """Outcomes by key, in the order in which keys come."""
+    found: dict = {}
+    for outcome in outcomes:
+        found.setdefault(key(outcome), []).append(outcome)
+    return found
+
+
+def summary(outcomes: list[Outcome]) -> dict:
+    """What several seeds of one method, sequence and setting gave; deviation is the standard one over runs."""
+    frame, whole = (
+        np.array([getattr(outcome, f"ne_flip_{flip}_percent") for outcome in outcomes]) for flip in ("frame", "global")
+    )
+    pick = chosen(outcomes)
+    return {
+        "runs": len(outcomes),
+        "chosen_seed": pick.run.seed,
+        **{
+            f"{name}_ne_flip_{flip}_percent": float(value)
+            for name, *values in (
+                ("chosen", pick.ne_flip_frame_percent, pick.ne_flip_global_percent),
+                ("median", np.median(frame), np.median(whole)),
+                ("best", frame.min(), whole.min()),
+                ("worst", frame.max(), whole.max()),
+                ("mean", frame.mean(), whole.mean()),
+                ("deviation", frame.std(), whole.std()),
+            )
+            for flip, value in zip(("frame", "global"), values)
+        },
+        "bad_basin_share": float((whole > BAD_BASIN * np.median(whole)).mean()),
+        "seconds_median": float(np.median([outcome.seconds for outcome in outcomes])),
+    }
