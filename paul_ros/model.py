@@ -73,7 +73,7 @@ class Model:
     @property
     def min_visible(self) -> int:
         """Fewer visible points than this are not lifted: the shape would be mostly guessed."""
-        return min(min_visible(len(points)) for points in _parts(self.layout))
+        return min(min_visible(len(part.points)) for part in self.layout.parts)
 
     def normalise(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """Image points (N,2,P) as the encoder takes them: centred, in units of the frame's size or of the data's."""
@@ -115,7 +115,7 @@ class Model:
         for layer in range(layers):
             x = _elu(self._linear(f"decoder.{layer}", x))
         S = self._linear(f"decoder.{layers}", x).reshape(len(x), 3, -1)
-        return to_unit_size(S, self.layout) if self.scale == "free" else S - S.mean(2, keepdims=True)
+        return to_unit_size(S, self.layout) if self.scale == "free" else to_centre(S, self.layout)
 
     def shape(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """f_d(h(W, M)): canonical shapes (N,3,P) in model units of image points (N,2,P)."""
@@ -141,17 +141,12 @@ def min_visible(points: int) -> int:
     return min(points, max(4, math.ceil(0.3 * points)))
 
 
-def _parts(layout: Layout) -> list[tuple[int, ...]]:
-    """Points of each of the layout's categories; all points where it is of one."""
-    return list(layout.categories.values()) or [tuple(range(len(layout.names)))]
-
-
 def enough_visible(visible: np.ndarray, layout: Layout) -> np.ndarray:
     """Whether frames with visibility (N,P) show enough points to be lifted, (N,): of one category, where it has some.
 
     Arrays and tensors alike.
     """
-    enough = [visible[:, list(points)].sum(1) >= min_visible(len(points)) for points in _parts(layout)]
+    enough = [visible[:, list(part.points)].sum(1) >= min_visible(len(part.points)) for part in layout.parts]
     return functools.reduce(operator.or_, enough)
 
 
@@ -171,19 +166,32 @@ def normalise(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
     return W / np.where(size > 0, size, 1.0)
 
 
+def to_centre(S: np.ndarray, layout: Layout) -> np.ndarray:
+    """Shapes (N,3,P) about the mean of their points; each category's about its own."""
+    centred = np.empty_like(S)
+    for part in layout.parts:
+        points = list(part.points)
+        centred[:, :, points] = S[:, :, points] - S[:, :, points].mean(2, keepdims=True)
+    return centred
+
+
 def to_unit_size(S: np.ndarray, layout: Layout) -> np.ndarray:
-    """Shapes (N,3,P) centred on their mean, in model units.
+    """Shapes (N,3,P) about the mean of their points, in model units.
 
     The size of a shape seen by weak perspective is free.  Where the layout has edges the mean edge length is 1, because
-    bones keep their lengths when a body moves; else the root mean square distance to the centre is 1.
+    bones keep their lengths when a body moves; else the root mean square distance to the centre is 1.  Of several
+    categories each is measured by itself.
     """
-    S = S - S.mean(2, keepdims=True)
-    if layout.edges:
-        start, end = np.array(layout.edges).T
-        size = np.linalg.norm(S[:, :, start] - S[:, :, end], axis=1).mean(1)
-    else:
-        size = np.sqrt((S**2).sum((1, 2)) / S.shape[2])
-    return S / np.maximum(size, 1e-6)[:, None, None]
+    S = to_centre(S, layout)
+    for part in layout.parts:
+        points = list(part.points)
+        if part.edges:
+            start, end = np.array(part.edges).T
+            size = np.linalg.norm(S[:, :, start] - S[:, :, end], axis=1).mean(1)
+        else:
+            size = np.sqrt((S[:, :, points] ** 2).sum((1, 2)) / len(points))
+        S[:, :, points] /= np.maximum(size, 1e-6)[:, None, None]
+    return S
 
 
 def _relu(x: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ of two layouts that are only nearly the same place on the body have different na
 from __future__ import annotations
 
 import difflib
+import re
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from importlib import resources
@@ -43,6 +44,14 @@ class Handedness:
     above: tuple[int, ...]
     behind: tuple[int, ...]
     front: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Points that belong to one object, and the edges between them, as indices of the layout."""
+
+    points: tuple[int, ...]
+    edges: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
@@ -106,6 +115,12 @@ class Layout:
         place = {frozenset(edge): index for index, edge in enumerate(self.edges)}
         twins = (frozenset(self.mirror[list(edge)].tolist()) for edge in self.edges)
         return np.array([place.get(twin, index) for index, twin in enumerate(twins)], int)
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """The categories; one part of all points where there are none."""
+        every = self.categories.values() or [tuple(range(len(self.names)))]
+        return tuple(Part(points, tuple(edge for edge in self.edges if set(edge) <= set(points))) for points in every)
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -205,13 +220,15 @@ def anonymous_layout(points: int, edges: tuple[tuple[int, int], ...] = ()) -> La
 
 
 def load_layout(name_or_path: str | Path) -> Layout:
-    """A shipped layout by name, or a user's own by the path of its YAML file.
+    """A shipped layout by name, an anonymous one as points41, or a user's own by the path of its YAML file.
 
     Raises LayoutError: unknown name, unreadable or oversized file, or a file that describes no layout.
     """
     name = str(name_or_path)
     if name in layout_names():
         return Layout.from_dict(yaml.safe_load((_SHIPPED / f"{name}.yaml").read_bytes()))
+    if anonymous := re.fullmatch(r"points(\d{1,6})", name):
+        return anonymous_layout(int(anonymous[1]))
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml") and len(path.parts) < 2:
         raise LayoutError(_unknown(name))

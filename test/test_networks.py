@@ -7,8 +7,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paul_ros.model import ModelError, check_size, dictionary_sizes, load_model, save_model, weight_shapes
-from paul_ros.skeleton import anonymous_layout, load_layout
+from paul_ros.model import (
+    ModelError,
+    check_size,
+    dictionary_sizes,
+    load_model,
+    save_model,
+    to_centre,
+    to_unit_size,
+    weight_shapes,
+)
+from paul_ros.skeleton import Layout, anonymous_layout, load_layout
+from training import networks as networks_module
 from training.export import architecture
 from training.networks import build_networks
 from training.recipe import Recipe
@@ -179,3 +189,27 @@ def test_the_depth_of_c3dpo_fits_a_model_file():
 
 def test_dense_models_fit_a_model_file():
     check_size(architecture(Recipe()), 6890)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 99), st.booleans())
+def test_categories_are_centred_and_measured_each_by_itself(seed, edges):
+    """In any order of their points; numpy and torch alike."""
+    order = np.random.default_rng(seed).permutation(11)
+    names = [f"p{i}" for i in range(11)]
+    parts = {"a": [names[i] for i in order[:4]], "b": [names[i] for i in order[4:]]}
+    bones = [parts["a"][:2], parts["b"][1:3], parts["b"][2:4]] if edges else []
+    layout = Layout.from_dict({"name": "two", "names": names, "root": names, "edges": bones, "categories": parts})
+    S = np.random.default_rng(seed).standard_normal((5, 3, 11))
+    found = to_unit_size(S, layout)
+    np.testing.assert_allclose(networks_module.to_unit_size(torch.from_numpy(S), layout).numpy(), found, atol=1e-9)
+    np.testing.assert_allclose(networks_module.to_centre(torch.from_numpy(S), layout).numpy(), to_centre(S, layout))
+    for points in (order[:4], order[4:]):
+        own = found[:, :, points]
+        np.testing.assert_allclose(own.mean(2), 0, atol=1e-9)
+        if edges:
+            pairs = [(names.index(a), names.index(b)) for a, b in bones if names.index(a) in points]
+            sizes = [np.linalg.norm(found[:, :, a] - found[:, :, b], axis=1) for a, b in pairs]
+            np.testing.assert_allclose(np.mean(sizes, axis=0), 1, rtol=1e-6)
+        else:
+            np.testing.assert_allclose((own**2).sum((1, 2)) / len(points), 1)

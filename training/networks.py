@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from paul_ros.model import CONVOLUTIONAL, RESIDUAL, dictionary_sizes
-from paul_ros.skeleton import Layout
+from paul_ros.skeleton import Layout, Part
 from training.recipe import Recipe
 
 _FREE_CODE_SIZE = 0.1
@@ -103,7 +103,7 @@ class ShapeDecoder(nn.ModuleList):
         for layer in inner:
             code = F.elu(layer(code))
         S = last(code).unflatten(1, (3, -1))
-        return to_unit_size(S, self.layout) if self.unit_size else S - S.mean(2, keepdim=True)
+        return to_unit_size(S, self.layout) if self.unit_size else to_centre(S, self.layout)
 
 
 class ShapeEncoder(nn.ModuleList):
@@ -164,18 +164,46 @@ def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
     return Paul(encoder, decoder, shape_encoder, free_codes)
 
 
+def to_centre(S: Tensor, layout: Layout) -> Tensor:
+    """The torch twin of ``paul_ros.model.to_centre``."""
+    if len(layout.parts) == 1:
+        return S - S.mean(2, keepdim=True)
+    return _joined([part - part.mean(2, keepdim=True) for part in _split(S, layout)], layout)
+
+
 def to_unit_size(S: Tensor, layout: Layout) -> Tensor:
     """The torch twin of ``paul_ros.model.to_unit_size``."""
-    S = S - S.mean(2, keepdim=True)
-    if layout.edges:
-        size = edge_lengths(S, layout).mean(1)
+    S = to_centre(S, layout)
+    if len(layout.parts) == 1:
+        return S / _size(S, S, layout.parts[0])
+    return _joined([own / _size(S, own, part) for own, part in zip(_split(S, layout), layout.parts)], layout)
+
+
+def _size(S: Tensor, own: Tensor, part: Part) -> Tensor:
+    """Sizes (N,1,1) of one part of shapes (N,3,P), by its edges or by its own points (N,3,p)."""
+    if part.edges:
+        size = _lengths(S, part.edges).mean(1)
     else:
-        size = S.square().sum((1, 2)).div(S.shape[2]).clamp_min(1e-12).sqrt()
-    return S / size.clamp_min(1e-6)[:, None, None]
+        size = own.square().sum((1, 2)).div(own.shape[2]).clamp_min(1e-12).sqrt()
+    return size.clamp_min(1e-6)[:, None, None]
+
+
+def _split(S: Tensor, layout: Layout) -> list[Tensor]:
+    return [S[:, :, list(part.points)] for part in layout.parts]
+
+
+def _joined(parts: list[Tensor], layout: Layout) -> Tensor:
+    """The inverse of _split."""
+    order = torch.tensor([point for part in layout.parts for point in part.points], device=parts[0].device)
+    return torch.cat(parts, dim=2)[:, :, order.argsort()]
 
 
 def edge_lengths(S: Tensor, layout: Layout) -> Tensor:
     """Lengths (N,E) of the layout's edges in shapes (N,3,P)."""
-    start, end = map(list, zip(*layout.edges))
+    return _lengths(S, layout.edges)
+
+
+def _lengths(S: Tensor, edges: tuple[tuple[int, int], ...]) -> Tensor:
+    start, end = map(list, zip(*edges))
     # The small constant keeps the square root's gradient finite where two points coincide.
     return (S[:, :, start] - S[:, :, end]).square().sum(1).add(1e-12).sqrt()

@@ -147,8 +147,9 @@ def paul_terms(
 ) -> Terms:
     """Evaluate the objective on a batch, or on this process's share of it: terms are always those of the batch."""
     found = fit(networks, recipe, views, rows)
-    ae = None if found.ae is None else _distance(found.ae, found.points)
-    return _terms(networks, layout, recipe, found.code, found.shape, ae, _distance(found.ad, found.points), share)
+    own = own_points(views.visible, layout)
+    ae = None if found.ae is None else _distance(found.ae, found.points, own)
+    return _terms(networks, layout, recipe, found.code, found.shape, ae, _distance(found.ad, found.points, own), share)
 
 
 def regression_terms(
@@ -157,10 +158,11 @@ def regression_terms(
     """The same objective with known canonical shapes S (N,3,P) in place of R^T [W; z]: equation 3, supervised."""
     code = networks.codes(views.W, views.visible, rows)
     shape = networks.decoder(code)
+    own = own_points(views.visible, layout)
     ae = None
     if recipe.streams == "both":
-        ae = _distance(networks.decoder(networks.shape_encoder(shape)), S)
-    return _terms(networks, layout, recipe, code, shape, ae, _distance(shape, S), share)
+        ae = _distance(networks.decoder(networks.shape_encoder(shape)), S, own)
+    return _terms(networks, layout, recipe, code, shape, ae, _distance(shape, S, own), share)
 
 
 def _terms(
@@ -210,9 +212,23 @@ def undo_perspective(views: Views, depth: Tensor) -> Tensor:
     return centre(ray * stretch, views.visible) * views.visible[:, None] / views.size
 
 
-def _distance(X: Tensor, target: Tensor) -> Tensor:
-    """Frobenius distances (N,), unsquared; the small constant keeps their gradient finite where nothing is left."""
-    return (X - target).square().sum((1, 2)).add(1e-8 * X.shape[2]).sqrt()
+def own_points(visible: Tensor, layout: Layout) -> Tensor | None:
+    """The points (N,P) of each frame's category, that of most of its visible points; None where there is but one.
+
+    A frame's object has no other points, so that what the networks make of them costs nothing.
+    """
+    if not layout.categories:
+        return None
+    member = torch.zeros(len(layout.categories), visible.shape[1], device=visible.device)
+    for category, points in zip(member, layout.categories.values()):
+        category[list(points)] = 1
+    return member[(visible.float() @ member.T).argmax(1)]
+
+
+def _distance(X: Tensor, target: Tensor, own: Tensor | None) -> Tensor:
+    """Frobenius distances (N,) of own points, unsquared; the small constant keeps the gradient finite at distance 0."""
+    difference = X - target if own is None else (X - target) * own[:, None]
+    return difference.square().sum((1, 2)).add(1e-8 * X.shape[2]).sqrt()
 
 
 def handedness_violation(S: Tensor, layout: Layout, margin: float = 0.5) -> Tensor:

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What may be trained on, and what is refused in one clear line."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from paul_ros.skeleton import load_layout
+from training import data as module
+from training.data import DataError, load_training_data
+
+
+def views(frames=6, points=9, seed=0):
+    return np.random.default_rng(seed).uniform(100, 500, (frames, 2, points))
+
+
+def load(tmp_path, layout=None, **arrays):
+    np.savez(tmp_path / "data.npz", **arrays)
+    return load_training_data(tmp_path / "data.npz", layout)
+
+
+def twin(W):
+    W[:, :, 5] = W[:, :, 2]
+    return W
+
+
+def with_value(value):
+    W = views()
+    W[2, 1, 3] = value
+    return W
+
+
+BAD = {
+    "3D": (dict(W=np.zeros((6, 3, 9))), r"must be numbers \(F,2,P\)"),
+    "flat": (dict(W=np.zeros((6, 18))), r"must be numbers \(F,2,P\)"),
+    "no frames": (dict(W=np.zeros((0, 2, 9))), "nothing to train on"),
+    "two points": (dict(W=views(points=2)), "make no layout: names has 2 points"),
+    "too many points": (dict(W=np.zeros((1, 2, 20_001))), "make no layout"),
+    "all hidden": (dict(W=views(), visible=np.zeros((6, 9), bool)), "nothing to train on"),
+    "one frame again and again": (dict(W=np.repeat(views(1), 6, axis=0)), "all the same"),
+    "one frame": (dict(W=views(1)), "all the same"),
+    "a point twice": (dict(W=twin(views())), "p02 and p05.*one place in every frame"),
+    "NaN called visible": (dict(W=with_value(np.nan), visible=np.ones((6, 9), bool)), "NaN or infinite at 1 of 54"),
+    "infinite": (dict(W=with_value(np.inf)), "NaN or infinite at 1 of 54"),
+    "huge": (dict(W=with_value(1e9)), "no pixels"),
+    "far beyond float32": (dict(W=with_value(1e300)), "no pixels"),
+    "rays of pixels": (dict(W=views(), calibrated=True), "no rays"),
+    "edges beyond the points": (dict(W=views(), edges=[[0, 9]]), "edges must join points 0 to 8"),
+    "an edge to itself": (dict(W=views(), edges=[[3, 3]]), "two different points"),
+    "edges in threes": (dict(W=views(), edges=[[0, 1, 2]]), r"whole numbers \(E,2\)"),
+    "edges of numbers": (dict(W=views(), edges=[[0.0, 1.0]]), r"whole numbers \(E,2\)"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_data_is_refused(tmp_path, case):
+    arrays, message = BAD[case]
+    with pytest.raises(DataError, match=message) as caught:
+        load(tmp_path, **arrays)
+    assert "\n" not in str(caught.value) and "data.npz" in str(caught.value)
+
+
+def test_frames_that_differ_where_either_is_hidden_are_all_the_same(tmp_path):
+    W, visible = np.repeat(views(1), 6, axis=0), np.ones((6, 9), bool)
+    W[3, :, 4], visible[3, 4] = 0, False
+    with pytest.raises(DataError, match="all the same"):
+        load(tmp_path, W=W, visible=visible)
+    W[3, :, 5] += 1
+    assert len(load(tmp_path, W=W, visible=visible).W) == 6
+
+
+def test_points_never_visible_are_noted_and_no_twins(tmp_path):
+    visible = np.ones((6, 9), bool)
+    visible[:, [2, 7]] = False
+    (note,) = load(tmp_path, W=views(), visible=visible).notes
+    assert note.startswith("p02, p07 of layout 'points9' never visible")
+    assert load(tmp_path, W=views()).notes == ()
+
+
+def test_layouts_are_guessed_by_the_number_of_points(tmp_path):
+    assert load(tmp_path, W=views(points=17)).layout == load_layout("coco17")
+    layout = load(tmp_path, W=views(points=120), edges=[[0, 119]]).layout
+    assert (layout.name, layout.names[119], layout.edges) == ("points120", "p119", ((0, 119),))
+    assert load(tmp_path, load_layout("points9"), W=views()).layout.name == "points9"
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(2, 40), st.integers(3, 12), st.floats(0, 0.5), st.integers(0, 99))
+def test_what_is_loaded_is_what_was_given(tmp_path_factory, frames, points, hidden, seed):
+    rng = np.random.default_rng(seed)
+    W, visible = views(frames, points, seed), rng.random((frames, points)) >= hidden
+    keeps = visible.sum(1) >= module.min_visible(points)
+    if not keeps.any() or keeps.sum() < 2:
+        return
+    folder = tmp_path_factory.mktemp("data")
+    masked = load(folder, load_layout(f"points{points}"), W=W, visible=visible)
+    marked = load(folder, load_layout(f"points{points}"), W=np.where(visible[:, None], W, np.nan))
+    np.testing.assert_array_equal(masked.W, np.where(visible[:, None], W, 0)[keeps].astype(np.float32))
+    np.testing.assert_array_equal(masked.W, marked.W)
+    np.testing.assert_array_equal(masked.visible, marked.visible)
+    assert masked.left_out == (~keeps).sum()
+
+
+def test_the_digest_is_that_of_the_bytes(tmp_path):
+    """A checkpoint of an earlier version knows its data still."""
+    data = load(tmp_path, W=views())
+    digest = hashlib.sha256(data.W.tobytes())
+    digest.update(np.packbits(data.visible).tobytes())
+    assert data.sha256 == digest.hexdigest()
+
+
+@pytest.mark.parametrize("block", [1, 4, 1024])
+def test_the_image_unit_is_the_rms_coordinate(tmp_path, monkeypatch, block):
+    monkeypatch.setattr(module, "_BLOCK", block)
+    visible = np.random.default_rng(1).random((6, 9)) < 0.7
+    data = load(tmp_path, W=views(), visible=visible)
+    coordinates = []
+    for w, seen in zip(data.W.astype(float), data.visible):
+        coordinates.append((w[:, seen] - w[:, seen].mean(1, keepdims=True)).ravel())
+    assert data.image_unit == pytest.approx(np.sqrt((np.concatenate(coordinates) ** 2).mean()), rel=1e-6)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several files as one: recordings of one layout follow each other, categories of objects lie side by side.
+
+One model of several categories, as in C3DPO (Novotny et al., ICCV 2019) and PAUL on Pascal3D+: the points of all
+categories side by side in one layout, of which a frame shows those of its own category; the others are hidden, and
+cost nothing.  Which category a frame is of, the networks see from the visibility mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from paul_ros.parameters import DEFAULTS
+from paul_ros.skeleton import Layout
+from training.data import DataError, TrainingData, load_training_data
+
+
+def load_files(
+    paths: Sequence[str | Path],
+    layout: Layout | None = None,
+    topic: str | None = None,
+    min_confidence: float = DEFAULTS["min_confidence"],
+) -> TrainingData:
+    """Read one file to train on, or several: each as ``load_training_data`` does.
+
+    With a layout given, or of 17 points all of them, several files are recordings of the same points.  Else each is a
+    category of its own, named by its file.
+
+    Raises:
+        DataError, BagError: as ``load_training_data``; or files that cannot be trained on together.
+    """
+    parts = [load_training_data(path, layout, topic, min_confidence) for path in paths]
+    if len({part.calibrated for part in parts}) > 1:
+        raise DataError(
+            "some files hold rays and others pixels (`calibrated`, or a bag's CameraInfo): train them apart"
+        )
+    if len(parts) == 1:
+        return parts[0]
+    if layout is not None or all(part.layout.name == "coco17" for part in parts):
+        return one_after_another(parts)
+    names = [Path(path).stem for path in paths]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise DataError(
+            f"each file is a category, named by its file, and {', '.join(twice)} is there twice: rename one; "
+            f"recordings of one layout are joined with --layout (points41, say, for 41 points)"
+        )
+    return side_by_side(names, parts)
+
+
+def one_after_another(parts: Sequence[TrainingData]) -> TrainingData:
+    """All frames of data of one layout."""
+    W = np.concatenate([part.W for part in parts])
+    visible = np.concatenate([part.visible for part in parts])
+    return _joined(parts, W, visible, parts[0].layout)
+
+
+def side_by_side(names: Sequence[str], parts: Sequence[TrainingData]) -> TrainingData:
+    """All frames of data of several categories, in the joint layout of all their points: the others' are hidden."""
+    layout = joint_layout(names, [part.layout for part in parts])
+    frames, points = sum(len(part.W) for part in parts), len(layout.names)
+    W, visible = np.zeros((frames, 2, points), np.float32), np.zeros((frames, points), bool)
+    row = 0
+    for part, (first, *_, last) in zip(parts, layout.categories.values()):
+        frames = slice(row, row + len(part.W))
+        W[frames, :, first : last + 1], visible[frames, first : last + 1] = part.W, part.visible
+        row += len(part.W)
+    return _joined(parts, W, visible, layout)
+
+
+def joint_layout(names: Sequence[str], layouts: Sequence[Layout]) -> Layout:
+    """The points of several layouts side by side, category by category, each named ``category.point``.
+
+    Raises:
+        LayoutError: more points than a layout can have.
+    """
+    joint = {"names": [], "edges": [], "left_right": [], "handedness": []}
+    categories = {}
+    for category, layout in zip(names, layouts):
+        own = _prefixed({key: layout.to_dict()[key] for key in joint}, f"{category}.")
+        for key, items in own.items():
+            joint[key] += items
+        categories[category] = own["names"]
+    return Layout.from_dict({"name": "+".join(names), **joint, "root": joint["names"], "categories": categories})
+
+
+def _prefixed(item: object, prefix: str) -> object:
+    """A layout's lists with every point's name prefixed."""
+    if isinstance(item, str):
+        return prefix + item
+    if isinstance(item, dict):
+        return {key: _prefixed(value, prefix) for key, value in item.items()}
+    return [_prefixed(value, prefix) for value in item]
+
+
+def _joined(parts: Sequence[TrainingData], W: np.ndarray, visible: np.ndarray, layout: Layout) -> TrainingData:
+    return TrainingData(
+        W,
+        visible,
+        layout,
+        parts[0].calibrated,
+        source=", ".join(part.source for part in parts),
+        left_out=sum(part.left_out for part in parts),
+        notes=tuple(f"{part.source}: {note}" for part in parts for note in part.notes),
+    )
