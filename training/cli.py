@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``paul train``: 2D keypoints in, a model file out."""
+"""``paul train``: 2D keypoints in, a model file out, or the 3D shapes of the very frames."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -16,9 +18,16 @@ from paul_ros.files import write_atomically
 from paul_ros.model import ModelError, check_size
 from paul_ros.parameters import DEFAULTS
 from paul_ros.skeleton import LayoutError, load_layout
-from training.data import DataError, load_training_data
+from training.categories import load_files
+from training.data import DataError, TrainingData
+from training.distributed import is_first, joined
+from training.encoder_fit import fit_encoder
 from training.export import architecture, export_model
 from training.recipe import Recipe, RecipeError, recipe_names
+from training.reconstruction import Run, reconstruction_of, restarts, run_folder, train_restarts
+from training.starting import START
+from training.tensorboard import FOLDER as BOARD
+from training.tensorboard import Board, need_tensorboard
 from training.trainer import CHECKPOINT, LOG, Trainer, TrainingError
 
 ERRORS = (BagError, DataError, RecipeError, TrainingError, ModelError, LayoutError)
@@ -28,11 +37,23 @@ ERRORS = (BagError, DataError, RecipeError, TrainingError, ModelError, LayoutErr
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument(
-        "data", metavar="DATA", help="npz with W (F,2,P) and optional visible (F,P), or a bag of 2D keypoints"
+        "data",
+        metavar="DATA",
+        nargs="+",
+        help="npz with W (F,2,P) and optional visible (F,P), or a bag of 2D keypoints; several: recordings of one "
+        "layout, or else categories of objects, each file one",
     )
-    parser.add_argument("-o", "--output", metavar="MODEL", required=True, type=Path, help="model file to write (.npz)")
+    parser.add_argument("-o", "--output", metavar="MODEL", type=Path, help="model file to write (.npz)")
     parser.add_argument(
-        "--layout", default="coco17", help="layout of the points: a shipped name or a YAML file (default: %(default)s)"
+        "--shapes",
+        metavar="SHAPES",
+        type=Path,
+        help="write the 3D shapes of the frames themselves (.npz); with it, no MODEL need be written",
+    )
+    parser.add_argument(
+        "--layout",
+        help="layout of the points: a shipped name, points41 for 41 points without names, or a YAML file "
+        "(default: coco17 for 17 points and for bags, else points without names)",
     )
     parser.add_argument("--topic", help="topic of a bag, where it has several with 2D keypoints")
     parser.add_argument(
@@ -50,6 +71,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fresh", action="store_true", help="start over instead of continuing the run beside MODEL")
     parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="where the networks train; auto: on a GPU if torch finds one (default: %(default)s)",
+    )
+    parser.add_argument(
         "--threads",
         type=int,
         default=1,
@@ -57,50 +84,136 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="CPU threads; the networks are small: more gain little, and lose much on a busy machine (default: 1)",
     )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
+    parser.add_argument("--tensorboard", action="store_true", help="write logs for TensorBoard beside the checkpoint")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, or continue, and export. Raises one of ERRORS."""
-    if args.output.suffix != ".npz":
-        raise DataError(f"the model file must end in .npz, not '{args.output.name}'")
-    folder = args.output.with_suffix(".run")
-    check_outputs([args.output, args.json, folder / CHECKPOINT, folder / LOG], [args.data, args.recipe, args.layout])
     recipe = Recipe.load(args.recipe, args.set)
-    data = load_training_data(args.data, load_layout(args.layout), args.topic, args.min_confidence)
-    recipe.check_points(data.layout)
-    check_size(architecture(recipe), len(data.layout.names))
-    if args.fresh:
-        for name in (CHECKPOINT, LOG):
-            (folder / name).unlink(missing_ok=True)
+    folders = _run_folders(args, recipe)
+    layout = load_layout(args.layout) if args.layout else None
+    data = load_files(args.data, layout, args.topic, args.min_confidence)
+    _check(args, recipe, data)
     torch.set_num_threads(max(1, args.threads))
-    trainer = Trainer(data, recipe, folder)
-    resumed = trainer.resume()
-    left_out = f", {data.left_out} left out (too few points)" if data.left_out else ""
-    print(
-        f"{len(data.W)} frames of layout {data.layout.name} from {data.source}{left_out}"
-        + (f"; continuing at step {trainer.step}" if resumed else ""),
-        file=sys.stderr,
-    )
-    try:
-        _watch(trainer, args.quiet)
-    except KeyboardInterrupt:
-        raise TrainingError(f"stopped at step {trainer.step} of {recipe.steps}: the same command continues") from None
-    header = export_model(trainer, args.output, _command())
-    _report(header, args)
+    device = _device(args.device)
+    with joined(device):
+        if args.fresh and is_first():
+            _forget(folders)
+        _introduce(data, args)
+        runs = train_restarts(data, recipe, _folder(args), device, lambda trainer: _watch(trainer, args))
+        if is_first():
+            _write(runs, args)
     return 0
 
 
-def _watch(trainer: Trainer, quiet: bool) -> None:
+def _folder(args: argparse.Namespace) -> Path:
+    return (args.output or args.shapes).with_suffix(".run")
+
+
+def _run_folders(args: argparse.Namespace, recipe: Recipe) -> list[Path]:
+    """Folders of the restarts, after a look at whether all that will be written can be."""
+    if not args.output and not args.shapes:
+        raise DataError("nothing to write: name a model file with -o, or a file of 3D shapes with --shapes")
+    for path in filter(None, (args.output, args.shapes)):
+        if path.suffix != ".npz":
+            raise DataError(f"the file must end in .npz, not '{path.name}'")
+    folders = [run_folder(_folder(args), recipe, one.seed) for one in restarts(recipe)]
+    kept = [folder / name for folder in folders for name in (CHECKPOINT, LOG, START)]
+    check_outputs([args.output, args.shapes, args.json, *kept], [*args.data, args.recipe, args.layout])
+    return folders
+
+
+def _check(args: argparse.Namespace, recipe: Recipe, data: TrainingData) -> None:
+    """What can be told before the first step."""
+    recipe.check_points(data.layout)
+    if args.output and not recipe.steps and not recipe.regression_steps:
+        raise RecipeError("no networks are trained with steps: 0, so there is no model: ask for --shapes instead of -o")
+    if args.output:
+        check_size(architecture(recipe), len(data.layout.names))
+    if args.tensorboard:
+        need_tensorboard()
+
+
+def _device(name: str) -> torch.device:
+    """The device, and torch told to compute the same there every time as far as it can."""
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        raise TrainingError("torch finds no GPU here: use --device cpu, or install a torch that is built for yours")
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    torch.cuda.set_device(device)
+    return device
+
+
+def _forget(folders: list[Path]) -> None:
+    for folder in folders:
+        for name in (CHECKPOINT, LOG, START):
+            (folder / name).unlink(missing_ok=True)
+        shutil.rmtree(folder / BOARD, ignore_errors=True)
+
+
+def _introduce(data: TrainingData, args: argparse.Namespace) -> None:
+    if not is_first():
+        return
+    left_out = f", {data.left_out} left out (too few points)" if data.left_out else ""
+    print(f"{len(data.W)} frames of layout {data.layout.name} from {data.source}{left_out}", file=sys.stderr)
+    for note in data.notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+def _watch(trainer: Trainer, args: argparse.Namespace) -> None:
+    """Train to the end, showing and logging how it goes."""
+    begun, quiet = trainer.step, args.quiet or not is_first()
+    if begun and is_first():
+        print(f"seed {trainer.recipe.seed}: continuing at step {begun}", file=sys.stderr)
+    board = Board(trainer.folder, begun) if args.tensorboard and is_first() else None
+    try:
+        _prepare(trainer, quiet)
+        with _bar(quiet, total=trainer.steps, initial=begun, unit="step") as bar:
+            for row in trainer.run():
+                bar.update()
+                if board:
+                    board.write(row)
+                if row["step"] % 20 == 0:
+                    losses = {"loss": row["loss"], "ae": row["recon_ae"], "ad": row["recon_ad"]}
+                    bar.set_postfix({name: f"{value:.4f}" for name, value in losses.items()}, refresh=False)
+    except KeyboardInterrupt:
+        raise TrainingError(f"stopped at step {trainer.step} of {trainer.steps}: the same command continues") from None
+    finally:
+        if board:
+            board.close()
+    if trainer.stopped and is_first():
+        print(f"seed {trainer.recipe.seed}: the loss has settled, stopped at step {trainer.step}", file=sys.stderr)
+
+
+def _prepare(trainer: Trainer, quiet: bool) -> None:
+    if trainer.recipe.start == "random":
+        return
+    layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+    with _bar(quiet, total=1.0, desc=f"{trainer.recipe.start} start", bar_format=layout) as bar:
+        trainer.prepare(lambda done: bar.update(done - bar.n))
+
+
+def _bar(quiet: bool, **settings: object) -> tqdm:
     # Into a log file, a line twice a minute.
     interval = 0.1 if sys.stderr.isatty() else 30.0
-    steps, begun = trainer.recipe.steps, trainer.step
-    with tqdm(total=steps, initial=begun, unit="step", disable=quiet, mininterval=interval, dynamic_ncols=True) as bar:
-        for row in trainer.run():
-            bar.update()
-            if row["step"] % 20 == 0:
-                losses = {"loss": row["loss"], "ae": row["recon_ae"], "ad": row["recon_ad"]}
-                bar.set_postfix({name: f"{value:.4f}" for name, value in losses.items()}, refresh=False)
+    return tqdm(disable=quiet, mininterval=interval, dynamic_ncols=True, **settings)
+
+
+def _write(runs: list[Run], args: argparse.Namespace) -> None:
+    """Model and shapes of the best run, and what is said of all of them."""
+    best, header = runs[0].trainer, {}
+    if args.shapes:
+        reconstruction_of(runs).save(args.shapes)
+    if args.output:
+        if best.recipe.codes == "free":
+            left = fit_encoder(best)
+            print(f"2D encoder fitted to the codes, mean distance left {left:.4f}", file=sys.stderr)
+        header = export_model(best, args.output, _command())
+    _report(runs, header, args)
 
 
 def _command() -> str:
@@ -108,13 +221,28 @@ def _command() -> str:
     return " ".join(["paul", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])
 
 
-def _report(header: dict, args: argparse.Namespace) -> None:
+def _report(runs: list[Run], header: dict, args: argparse.Namespace) -> None:
+    if len(runs) > 1:
+        print("restarts by final loss, the first is kept:")
+        for run in runs:
+            print(f"  seed {run.seed}  loss {run.loss:.5f}  {run.trainer.seconds:.0f} s")
+    if args.shapes:
+        print(f"{args.shapes}: 3D shapes of {len(runs[0].trainer.data.W)} frames, loss {runs[0].loss:.5f}")
+    if args.output:
+        _report_model(header, args.output)
+    if args.json:
+        ranking = [
+            {"seed": run.seed, "loss": run.loss, "seconds": round(run.trainer.seconds, 1), "chosen": run is runs[0]}
+            for run in runs
+        ]
+        write_atomically(args.json, json.dumps({**header, "restarts": ranking}, indent=1).encode())
+
+
+def _report_model(header: dict, path: Path) -> None:
     training, metres = header["training"], header["metres_per_unit"]
     print(
-        f"{args.output}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
+        f"{path}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
         f"reconstruction loss {training['final']['recon_ad']:.4f}\n"
         f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}\n"
         f"  chirality: {'known' if header['chirality']['known'] else 'UNKNOWN'}, {header['chirality']['source']}"
     )
-    if args.json:
-        write_atomically(args.json, json.dumps(header, indent=1).encode())

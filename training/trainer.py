@@ -10,8 +10,11 @@ from __future__ import annotations
 import csv
 import io
 import math
+import signal
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +47,22 @@ _SETTLED = 1e-3
 
 class TrainingError(RuntimeError):
     """Training cannot go on; the text says what to do."""
+
+
+@contextmanager
+def _whole_step() -> Iterator[None]:
+    """Hold Ctrl-C back until the step is done: half of one in a checkpoint, and the run would not continue the same."""
+    if threading.current_thread() is not threading.main_thread():  # signals reach the main thread only
+        yield
+        return
+    asked = []
+    before = signal.signal(signal.SIGINT, lambda *about: asked.append(about))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if asked and callable(before):
+        before(*asked[0])
 
 
 class _Objective(nn.Module):
@@ -176,7 +195,8 @@ class Trainer:
         saved, begun = time.monotonic(), time.monotonic() - self.seconds
         try:
             while not self.finished:
-                row = self._advance(begun)
+                with _whole_step():
+                    row = self._advance(begun)
                 if time.monotonic() - saved > _CHECKPOINT_SECONDS:
                     self.save()
                     saved = time.monotonic()
