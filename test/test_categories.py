@@ -116,7 +116,7 @@ def test_files_that_do_not_go_together_are_refused(tmp_path):
 
 @pytest.mark.parametrize("scale", ["free", "unit"])
 def test_what_other_categories_have_costs_nothing(garage, scale):
-    """Points of the buses may be anywhere in a frame of a car, in both streams; its own points, seen or not, may not."""
+    """Points of the buses may be anywhere in a car's frame, in both streams; its own points, seen or not, may not."""
     data = load_files(garage)
     recipe = Recipe.from_dict({"bottleneck": 3, "hidden": [8], "width": 8, "scale": scale})
     torch.manual_seed(0)

@@ -16,6 +16,9 @@ from paul_ros.skeleton import Layout
 from training.recipe import Recipe
 from training.trainer import Trainer, predict_shapes, rule_share
 
+_SHAPES, _COORDINATES = 4096, 2**24
+"""Shapes of training frames that the mean is taken of: so many, or as many as have so many coordinates."""
+
 _MEAN_ROUNDS = 10
 _CLEAR = 0.95  # share of shapes on one side of the handedness rules that settles the chirality
 
@@ -26,13 +29,14 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
     Raises:
         ModelError: the weights do not make a model (NaN, say).
     """
-    shapes = predict_shapes(trainer.networks, trainer.data)
     layout, recipe = trainer.data.layout, trainer.recipe
+    shapes = predict_shapes(trainer.networks, trainer.data, min(_SHAPES, _COORDINATES // (3 * len(layout.names))))
+    mean = mean_shape(shapes)
     header = {
         "layout": layout.to_dict(),
         **architecture(recipe),
         **_scale(trainer),
-        "chirality": _chirality(shapes, layout, recipe.handedness_weight),
+        "chirality": _chirality(shapes, mean, layout, recipe.handedness_weight),
         "metres_per_unit": metres_per_unit(shapes, layout, recipe.known_lengths),
         "training": {
             "data": trainer.data.source,
@@ -50,7 +54,7 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
             },
         },
     }
-    save_model(path, header, {**_weights(trainer), "mean_shape": mean_shape(shapes)})
+    save_model(path, header, {**_weights(trainer), "mean_shape": mean})
     return header
 
 
@@ -100,20 +104,34 @@ def _final(trainer: Trainer) -> tuple[float, ...]:
     return tuple(round(float(value), 5) for value in last.mean(0))
 
 
-def _chirality(shapes: np.ndarray, layout: Layout, weight: float) -> dict:
-    """Which of the two mirror images the model's shapes are, and how that is known."""
+def _chirality(shapes: np.ndarray, mean: np.ndarray, layout: Layout, weight: float) -> dict:
+    """Which of the two mirror images the model's shapes are, and how that is known.
+
+    Without a rule to tell them apart, one sign for the whole model is left open by any number of orthographic views;
+    how far the shapes agree on it among themselves is measured by their mean shape.
+    """
     share = rule_share(shapes, layout)
     if share is None:
         return {
             "known": False,
             "source": "orthographic views alone leave the mirror image open; "
             "give the layout a handedness rule to settle it",
+            "same_side_share": round(same_side_share(shapes, mean), 4),
         }
     return {
         "known": share >= _CLEAR,
         "source": f"handedness rule of layout '{layout.name}', training weight {weight:g}",
         "training_share": round(share, 4),
     }
+
+
+def same_side_share(shapes: np.ndarray, mean: np.ndarray) -> float:
+    """Share of shapes (F,3,P) that turn onto the mean (3,P) better than their mirror images do.
+
+    With the singular values a >= b >= c of S mean^T, S fits by a + b +- c and its mirror image by a + b -+ c, with the
+    sign of the determinant.
+    """
+    return float((np.linalg.det(shapes @ mean.T) > 0).mean())
 
 
 def mean_shape(shapes: np.ndarray) -> np.ndarray:

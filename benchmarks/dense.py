@@ -1,0 +1,59 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Peak memory and time of training on thousands of points: a made-up articulated mesh, ``paul train`` as it is.
+
+    python benchmarks/dense.py [--points 6890] [--frames 5000] [--epochs 3] [--set KEY=VALUE ...]
+
+Memory is that of the whole command, from reading the file to the model file, as the kernel counts it (largest resident
+set of the process); an epoch is as many steps as show each frame once on average.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+
+def run(*arguments: object) -> float:
+    """Run a Python module in a process of its own; returns its peak memory in GB (1e9 bytes)."""
+    child = subprocess.Popen([sys.executable, "-m", *map(str, arguments)])
+    _, status, usage = os.wait4(child.pid, 0)
+    if status:
+        raise SystemExit(f"{arguments[0]} failed")
+    return usage.ru_maxrss * 1024 / 1e9
+
+
+def main() -> None:
+    """Make the mesh, train, print a line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=6890)
+    parser.add_argument("--frames", type=int, default=5000)
+    parser.add_argument("--epochs", type=int, default=3)
+    parser.add_argument("--batch", type=int, default=128)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="a setting of the recipe")
+    args = parser.parse_args()
+    steps = -(-args.epochs * args.frames // args.batch)
+    settings = [f"steps={steps}", f"batch={args.batch}", *args.set]
+    with tempfile.TemporaryDirectory() as folder:
+        mesh, model, report = (Path(folder) / name for name in ("mesh.npz", "model.npz", "report.json"))
+        run("training.synthetic", "-o", mesh, "--points", args.points, "--frames", args.frames)
+        overrides = [word for setting in settings for word in ("--set", setting)]
+        memory = run(
+            *("paul_ros.cli", "train", mesh, "-o", model, "--json", report, "--quiet", "--threads", args.threads),
+            *overrides,
+        )
+        seconds, size = json.loads(report.read_text())["training"]["seconds"], model.stat().st_size
+    print(
+        f"{args.frames} frames of {args.points} points, {args.threads} thread(s), batch {args.batch}: "
+        f"{seconds / args.epochs:.1f} s an epoch, peak memory {memory:.2f} GB, model file {size / 2**20:.0f} MiB"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a finished run becomes: sizes, mirror images and memory of the model file."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from paul_ros.model import load_model
+from training import export
+from training.data import load_training_data
+from training.export import export_model, same_side_share
+from training.recipe import Recipe
+from training.trainer import Trainer
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def data(tmp_path):
+    rng = np.random.default_rng(0)
+    S = rng.standard_normal((3, 11)) + 0.2 * rng.standard_normal((30, 3, 11))
+    S = rng.uniform(0.5, 2, (30, 1, 1)) * (Rotation.random(30, random_state=0).as_matrix() @ S)
+    np.savez(tmp_path / "views.npz", W=40 * S[:, :2] + 100)
+    return load_training_data(tmp_path / "views.npz")
+
+
+def trained(data, folder, **settings):
+    recipe = {"steps": 5, "width": 8, "batch": 8, "bottleneck": 3, "hidden": [8, 16], **settings}
+    trainer = Trainer(data, Recipe.from_dict(recipe), folder)
+    for _ in trainer.run():
+        pass
+    return trainer
+
+
+@pytest.mark.parametrize("scale", ["free", "unit"])
+@pytest.mark.parametrize("encoder", ["residual", "convolutional"])
+def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, encoder):
+    trainer = trained(data, tmp_path, scale=scale, encoder=encoder)
+    header = export_model(trainer, tmp_path / "m.npz", "paul train")
+    model = load_model(tmp_path / "m.npz")
+    assert model.scale == scale and ("image_unit" in header) == (scale == "unit")
+    assert header["chirality"]["known"] is False and 0 <= header["chirality"]["same_side_share"] <= 1
+    views = trainer.views(torch.arange(30))
+    np.testing.assert_allclose(model.normalise(data.W, data.visible), views.W.numpy(), atol=1e-5)
+    with torch.no_grad():
+        S = trainer.networks.decoder(trainer.networks.encoder(views.W, views.visible)).numpy()
+    np.testing.assert_allclose(model.shape(data.W, data.visible), S, atol=1e-4)
+    sizes = np.linalg.norm(model.shape(data.W, data.visible), axis=(1, 2))
+    assert (np.ptp(sizes) > 1e-3) == (scale == "unit")
+
+
+def test_free_codes_and_the_shape_encoder_stay_behind(data, tmp_path):
+    trainer = trained(data, tmp_path, codes="free")
+    export_model(trainer, tmp_path / "m.npz", "paul train")
+    names = load_model(tmp_path / "m.npz").weights
+    assert not [name for name in names if not name.startswith(("encoder.", "decoder."))]
+
+
+def test_the_mean_of_dense_shapes_is_taken_of_fewer(data, tmp_path, monkeypatch):
+    trainer = trained(data, tmp_path)
+    asked = []
+    monkeypatch.setattr(export, "predict_shapes", lambda *args: asked.append(args[2]) or np.ones((4, 3, 11)))
+    export_model(trainer, tmp_path / "m.npz", "paul train")
+    monkeypatch.setattr(export, "_COORDINATES", 330)
+    export_model(trainer, tmp_path / "m.npz", "paul train")
+    assert asked == [4096, 10]
+
+
+@pytest.mark.parametrize("mirrored", [0, 7, 20])
+def test_shapes_are_told_from_mirror_images_of_their_mean(mirrored):
+    rng = np.random.default_rng(0)
+    mean = rng.standard_normal((3, 9))
+    mean -= mean.mean(1, keepdims=True)
+    shapes = Rotation.random(20, random_state=0).as_matrix() @ (mean + 0.05 * rng.standard_normal((20, 3, 9)))
+    shapes[:mirrored, 2] *= -1
+    assert same_side_share(shapes, mean) == 1 - mirrored / 20
