@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shapes of the training frames themselves: what is observed stays, restarts are ranked, files are checked."""
+
+import json
+import sys
+import types
+
+import numpy as np
+import pytest
+import torch
+from test_training import train
+from tiny_data import centred, sequence, true_start
+
+from paul_ros.bag import BagError
+from paul_ros.metrics import normalised_error
+from paul_ros.model import load_model
+from training import cli, reconstruction, starting
+from training.data import DataError
+from training.encoder_fit import fit_encoder
+from training.recipe import Recipe, RecipeError
+from training.reconstruction import load_reconstruction, reconstruct, train_restarts
+from training.trainer import Trainer, TrainingError
+
+TINY = {
+    "bottleneck": 3,
+    "hidden": [8, 16],
+    "width": 16,
+    "blocks": 1,
+    "batch": 16,
+    "handedness_weight": 0,
+    "bone_weight": 0,
+}
+FREE = {**TINY, "codes": "free", "scale": "unit"}
+STARTED = {**FREE, "start": "linear", "regression_steps": 4, "steps": 4}
+AS_OPTIONS = [word for key, value in FREE.items() for word in ("--set", f"{key}={value}")]
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def search_for(data, camera, R, score=None, rows=slice(None)):
+    """A search that finds the truth."""
+    start = true_start(data, camera, R)
+
+    def search(kind, W, visible, seed, progress):
+        if progress:
+            progress(0.5)
+        found = starting.Start(start.rows[rows], start.shapes[rows], start.rotations[rows], float(seed), 2.5)
+        return found if score is None else starting.Start(*list(vars(found).values())[:3], score(seed), 2.5)
+
+    return search
+
+
+@pytest.mark.parametrize("scale", ["unit", "free"])
+@pytest.mark.parametrize("codes", ["free", "encoder"])
+def test_observed_points_stay_and_the_rest_is_in_their_unit(codes, scale):
+    data, camera, _ = sequence(hidden=0.2)
+    found = reconstruct(data, Recipe.from_dict({**TINY, "codes": codes, "scale": scale, "steps": 5}))
+    assert found.shapes.shape == camera.shape and found.codes.shape == (40, 3) and found.seconds > 0
+    seen = np.broadcast_to(data.visible[:, None], (40, 2, camera.shape[2]))
+    np.testing.assert_allclose(found.shapes[:, :2][seen], centred(camera, data.visible)[:, :2][seen], atol=1e-3)
+    np.testing.assert_allclose((found.shapes * data.visible[:, None]).sum(2), 0, atol=1e-2)
+    np.testing.assert_allclose(np.linalg.det(found.rotations), 1, rtol=1e-4)
+    assert np.isfinite(found.shapes).all() and (np.abs(found.shapes[:, 2]).max(1) > 1).all()
+
+
+@pytest.mark.parametrize("scale", ["unit", "free"])
+@pytest.mark.parametrize("codes", ["free", "encoder"])
+def test_a_rigid_body_is_reconstructed_from_a_good_start(monkeypatch, codes, scale):
+    """Regression and objective keep a start that is right: no sign or axis is lost on the way."""
+    given = sequence(bend=0.0)
+    monkeypatch.setattr(starting, "search", search_for(*given))
+    settings = {"regression_steps": 300, "steps": 50, "codes": codes, "scale": scale, "learning_rate": 6e-3}
+    found = reconstruct(given[0], Recipe.from_dict({**STARTED, **settings}))
+    error = normalised_error(found.shapes.swapaxes(1, 2), given[1].swapaxes(1, 2))
+    assert np.median(error) < 0.02
+
+
+def test_without_steps_the_starts_shapes_are_the_result(monkeypatch):
+    given = data, camera, _ = sequence(hidden=0.2)
+    monkeypatch.setattr(starting, "search", search_for(*given))
+    for scale in ("unit", "free"):
+        if scale == "free":  # where the search sees every frame in a size of its own
+            seen = data.visible[:, None]
+            size = np.sqrt((centred(camera, data.visible)[:, :2] ** 2 * seen).sum((1, 2)) / data.visible.sum(1) / 2)
+            start = true_start(*given)
+            shapes = start.shapes * (data.image_unit / size)[:, None, None].astype(np.float32)
+            changed = starting.Start(start.rows, shapes, start.rotations, 0.0, 2.5)
+            monkeypatch.setattr(starting, "search", lambda *given: changed)
+        found = reconstruct(data, Recipe.from_dict({**STARTED, "regression_steps": 0, "steps": 0, "scale": scale}))
+        np.testing.assert_allclose(found.shapes, centred(camera, data.visible), atol=0.02)
+        assert found.codes is None and found.loss == 0 and found.seconds == 2.5
+
+
+def test_a_start_of_some_frames_is_no_reconstruction(monkeypatch):
+    given = sequence()
+    monkeypatch.setattr(starting, "search", search_for(*given, rows=slice(0, 30)))
+    with pytest.raises(TrainingError, match="30 of 40 frames"):
+        reconstruct(given[0], Recipe.from_dict({**STARTED, "regression_steps": 0, "steps": 0}))
+    assert reconstruct(given[0], Recipe.from_dict(STARTED)).shapes.shape == given[1].shape
+
+
+def test_restarts_are_ranked_by_their_loss(tmp_path):
+    data = sequence()[0]
+    recipe = Recipe.from_dict({**FREE, "steps": 5, "restarts": 3, "seed": 4})
+    runs = train_restarts(data, recipe, tmp_path, "cpu", lambda trainer: [None for _ in trainer.run()])
+    assert sorted(run.seed for run in runs) == [4, 5, 6]
+    assert [run.loss for run in runs] == sorted(run.loss for run in runs) and len({run.loss for run in runs}) == 3
+    alone = reconstruct(data, Recipe.from_dict({**FREE, "steps": 5, "seed": runs[0].seed}))
+    best = reconstruct(data, recipe, tmp_path)  # which finds all runs finished
+    assert np.array_equal(alone.shapes, best.shapes) and alone.loss == best.loss == runs[0].loss
+    assert best.seconds == sum(run.trainer.seconds for run in runs)
+
+
+def test_starts_are_ranked_by_their_score(monkeypatch):
+    given = sequence()
+    scores = {0: -1.0, 1: -3.0, 2: -2.0}
+    monkeypatch.setattr(starting, "search", search_for(*given, score=scores.get))
+    recipe = Recipe.from_dict({**STARTED, "regression_steps": 0, "steps": 0, "restarts": 3})
+    assert reconstruct(given[0], recipe).loss == -3.0
+
+
+def test_frames_in_parts_are_those_at_once(tmp_path, monkeypatch):
+    data = sequence(hidden=0.2)[0]
+    recipe = Recipe.from_dict({**FREE, "steps": 3})
+    once = reconstruct(data, recipe, tmp_path)
+    monkeypatch.setattr(reconstruction, "_BATCH", 7)
+    parts = reconstruct(data, recipe, tmp_path)
+    np.testing.assert_allclose(once.shapes, parts.shapes, rtol=1e-4, atol=1e-3)
+    assert once.loss == pytest.approx(parts.loss, rel=1e-5)
+
+
+def test_progress_rises_to_one(monkeypatch):
+    given = sequence()
+    monkeypatch.setattr(starting, "search", search_for(*given))
+    told = []
+    reconstruct(given[0], Recipe.from_dict({**STARTED, "restarts": 2}), progress=told.append)
+    assert told == sorted(told) and told[0] > 0 and told[-1] == 1 and 0.5 in told
+
+
+def test_a_saved_reconstruction_is_read_again(tmp_path):
+    found = reconstruct(sequence()[0], Recipe.from_dict({**FREE, "steps": 2}))
+    found.save(tmp_path / "s.npz")
+    again = load_reconstruction(tmp_path / "s.npz")
+    for name, value in vars(found).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+
+
+@pytest.mark.parametrize("contents", [None, dict(W=np.zeros((4, 2, 5))), dict(shapes=np.zeros((4, 2, 5)))])
+def test_what_is_no_reconstruction_is_refused(tmp_path, contents):
+    path = tmp_path / "x.npz"
+    if contents:
+        np.savez(path, **{"rotations": np.zeros((4, 3, 3)), "loss": 0.0, "seconds": 0.0, **contents})
+    with pytest.raises(DataError, match="no saved reconstruction"):
+        load_reconstruction(path)
+
+
+# --- paul train
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "fit_encoder", lambda run: fit_encoder(run, 20))  # it is long
+    data, camera, _ = sequence()
+    np.savez(tmp_path / "seq.npz", W=data.W, S=camera)
+    return tmp_path / "seq.npz"
+
+
+def test_shapes_model_and_ranking_are_written(file, tmp_path, capsys):
+    shapes, model = tmp_path / "s.npz", tmp_path / "m.npz"
+    words = [*AS_OPTIONS, "--set", "steps=5", "--set", "restarts=2", "--json", tmp_path / "r.json", "--quiet"]
+    train(file, "--shapes", shapes, "-o", model, *words)
+    said = capsys.readouterr().out
+    ranking = json.loads((tmp_path / "r.json").read_text())["restarts"]
+    assert [run["chosen"] for run in ranking] == [True, False] and ranking[0]["loss"] < ranking[1]["loss"]
+    assert said.index(f"seed {ranking[0]['seed']}") < said.index(f"seed {ranking[1]['seed']}")
+    found = load_reconstruction(shapes)
+    assert found.loss == ranking[0]["loss"] and found.shapes.shape == (40, 3, 9)
+    assert load_model(model).header["training"]["recipe"]["seed"] == ranking[0]["seed"]
+    assert {path.name for path in (tmp_path / "m.run").iterdir()} == {"seed_0", "seed_1"}
+
+
+def test_shapes_alone_need_no_model(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(starting, "search", search_for(*sequence()))
+    nothing = ["--set", "start=linear", "--set", "steps=0", "--quiet"]
+    train(file, "--shapes", tmp_path / "s.npz", *AS_OPTIONS, *nothing)
+    assert load_reconstruction(tmp_path / "s.npz").codes is None
+    with pytest.raises(RecipeError, match="--shapes"):
+        train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, *nothing)
+    with pytest.raises(DataError, match="nothing to write"):
+        train(file, *AS_OPTIONS, *nothing)
+
+
+def test_fresh_forgets_the_start(file, tmp_path, monkeypatch):
+    words = ["--shapes", tmp_path / "s.npz", *AS_OPTIONS, "--set", "start=linear", "--set", "steps=0", "--quiet"]
+    for camera in (1, 2):
+        data, truth, R = sequence()
+        monkeypatch.setattr(starting, "search", search_for(data, camera * truth, R))
+        train(file, *words, *(["--fresh"] if camera == 2 else []))
+        depth = load_reconstruction(tmp_path / "s.npz").shapes[:, 2]
+        np.testing.assert_allclose(depth, camera * truth[:, 2], atol=0.05)
+
+
+def test_no_output_overwrites_the_kept_start(file, tmp_path):
+    (tmp_path / "m.run").mkdir()
+    with pytest.raises(BagError, match="two outputs"):
+        train(file, "-o", tmp_path / "m.npz", "--json", tmp_path / "m.run" / "start.npz", *AS_OPTIONS)
+
+
+def test_a_gpu_that_is_not_there_is_named(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(TrainingError, match="--device cpu"):
+        train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--device", "cuda")
+    assert cli._device("auto") == torch.device("cpu")
+
+
+def test_tensorboard_is_asked_for_before_the_first_step(file, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(ImportError, match=r"paul_ros\[tensorboard\]"):
+        train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--tensorboard")
+    assert not list((tmp_path / "m.run").glob("*"))
+
+
+def test_tensorboard_gets_the_losses(file, tmp_path, monkeypatch):
+    written, begun = [], []
+
+    class Writer:
+        def __init__(self, folder, purge_step):
+            begun.append((folder, purge_step))
+
+        def add_scalar(self, *scalar):
+            written.append(scalar)
+
+        def close(self):
+            written.append("closed")
+
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", types.SimpleNamespace(SummaryWriter=Writer))
+    train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--set", "steps=40", "--tensorboard", "--quiet")
+    assert begun == [(str(tmp_path / "m.run" / "tensorboard"), 1)] and written[-1] == "closed"
+    curve = [(value, step) for name, value, step in written[:-1] if name == "recon_ad"]
+    assert [step for _, step in curve] == [20, 40] and curve[1][0] < curve[0][0]
+
+
+def test_ctrl_c_says_how_to_go_on(file, tmp_path, monkeypatch):
+    advance = Trainer._advance
+
+    def interrupted(self, begun):
+        if self.step == 3:
+            raise KeyboardInterrupt
+        return advance(self, begun)
+
+    monkeypatch.setattr(Trainer, "_advance", interrupted)
+    with pytest.raises(TrainingError, match="step 3 of 5: the same command continues"):
+        train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--set", "steps=5", "--quiet")
+    assert (tmp_path / "m.run" / "checkpoint.pt").exists()

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training loop: its phases, what it keeps, and that any interruption leaves no trace in the weights."""
+
+import csv
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_data import sequence, true_start
+
+from paul_ros.onp import onp
+from paul_ros.skeleton import load_layout
+from training import starting, trainer
+from training.encoder_fit import fit_encoder
+from training.recipe import Recipe, RecipeError
+from training.reconstruction import final_loss
+from training.trainer import Trainer, TrainingError
+
+COCO = load_layout("coco17")
+TINY = {
+    "bottleneck": 3,
+    "hidden": [8, 16],
+    "width": 16,
+    "blocks": 1,
+    "batch": 8,
+    "handedness_weight": 0,
+    "bone_weight": 0,
+}
+FREE = {**TINY, "codes": "free", "scale": "unit"}
+STARTED = {**FREE, "start": "linear", "regression_steps": 6, "steps": 6}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """Searches for a start find the truth at once, and are counted."""
+    made = []
+
+    def search(kind, W, visible, seed, progress):
+        made.append((kind, W, seed))
+        return true_start(*sequence())
+
+    monkeypatch.setattr(starting, "search", search)
+    return made
+
+
+def through(run):
+    for _ in run.run():
+        pass
+    return run
+
+
+def until(run, step):
+    for row in run.run():
+        if row["step"] == step:
+            break
+    return run
+
+
+def same_weights(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a.networks.parameters(), b.networks.parameters()))
+
+
+@pytest.mark.parametrize("step", [0, 3, 6, 9])
+@pytest.mark.parametrize("codes", ["free", "encoder"])
+def test_a_run_stopped_anywhere_continues_to_the_bit(tmp_path, searches, step, codes):
+    data, _, _ = sequence()
+    recipe = Recipe.from_dict({**STARTED, "codes": codes, "roll": 1.0, "hide": 0.3, "patience": 4})
+    whole = through(Trainer(data, recipe, tmp_path / "whole"))
+    first = Trainer(data, recipe, tmp_path / "parts")
+    if step:
+        until(first, step)
+    else:
+        first.prepare()  # and killed before the first checkpoint
+    second = Trainer(data, recipe, tmp_path / "parts")
+    assert second.resume() == (step > 0) and second.step == step
+    assert same_weights(whole, through(second)) and len(searches) == 2
+    assert [row[0] for row in second.rows] == [row[0] for row in whole.rows]
+
+
+def test_the_search_gets_2d_in_its_unit_and_the_seed(tmp_path, searches):
+    data, _, _ = sequence(hidden=0.2)
+    for scale in ("unit", "free"):
+        recipe = Recipe.from_dict({**STARTED, "scale": scale, "seed": 5})
+        Trainer(data, recipe, tmp_path / scale).prepare()
+        kind, W, seed = searches[-1]
+        assert (kind, seed) == ("linear", 5)
+        assert np.sqrt(np.square(W).sum() / data.visible.sum() / 2) == pytest.approx(1, rel=1e-4)
+        assert (W[~np.broadcast_to(data.visible[:, None], W.shape)] == 0).all()
+    sizes = [np.square(w).sum((1, 2)) / seen.sum() for w, seen in zip(searches[-1][1][:, None], data.visible)]
+    np.testing.assert_allclose(sizes, 2, rtol=1e-4)  # every frame by itself where scales are free
+
+
+@pytest.mark.parametrize("codes", ["free", "encoder"])
+@pytest.mark.parametrize("scale", ["unit", "free"])
+def test_the_networks_learn_the_starts_shapes(tmp_path, searches, codes, scale):
+    recipe = Recipe.from_dict(
+        {**STARTED, "codes": codes, "scale": scale, "regression_steps": 300, "steps": 1, "learning_rate": 3e-3}
+    )
+    run = through(Trainer(sequence()[0], recipe, tmp_path))
+    rows = [dict(zip(trainer.LOG_COLUMNS, row)) for row in run.rows]
+    assert [row["phase"] for row in rows] == ["regression"] * 3 + ["unsupervised"]
+    first = next(iter(Trainer(sequence()[0], recipe, tmp_path / "other").run()))
+    assert rows[2]["recon_ad"] < 0.35 * first["recon_ad"] and rows[2]["recon_ae"] < 0.5 * first["recon_ae"]
+
+
+def test_a_start_is_of_the_chirality_that_the_layout_asks_for(tmp_path, monkeypatch):
+    data, camera, R = sequence(layout=COCO)
+    true = true_start(data, camera, R)
+    monkeypatch.setattr(starting, "search", lambda *given: start)
+    kept = []
+    for start in (true, starting.mirrored(true)):
+        run = Trainer(data, Recipe.from_dict(STARTED), tmp_path / str(len(kept)))
+        run.prepare()
+        kept.append(run.start)
+    np.testing.assert_allclose(kept[0].shapes, kept[1].shapes, atol=1e-6)
+    np.testing.assert_allclose(kept[0].rotations, kept[1].rotations, atol=1e-6)
+
+
+def test_a_mirrored_start_explains_the_same_views():
+    start = true_start(*sequence())
+    other = starting.mirrored(start)
+    a, b = (s.rotations @ s.shapes for s in (start, other))
+    np.testing.assert_allclose(a * [[1], [1], [-1]], b, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(other.rotations), 1, rtol=1e-5)
+
+
+def test_a_mirrored_object_has_a_mirrored_shape(tmp_path):
+    """The shape to be learned for a view with left and right exchanged fits that view."""
+    data, camera, R = sequence(layout=COCO)
+    lesson = starting.Lesson(true_start(data, camera, R), COCO, "unit", torch.device("cpu"))
+    S = lesson.shapes_of(torch.arange(40), torch.ones(40, 1, 1, dtype=torch.bool)).numpy()
+    W = (camera[:, :2] * [[-1], [1]])[:, :, COCO.mirror] / data.image_unit
+    found = onp(S, W, data.visible, "unit")
+    assert found.residual.max() < 1e-6
+
+
+@pytest.mark.parametrize("damage", ["junk", "other data"])
+def test_a_start_that_is_not_the_runs_is_refused(tmp_path, searches, damage):
+    data = sequence()[0]
+    Trainer(data, Recipe.from_dict(STARTED), tmp_path).prepare()
+    if damage == "junk":
+        (tmp_path / "start.npz").write_bytes(b"junk")
+    else:
+        data = sequence(seed=3)[0]
+    with pytest.raises(TrainingError, match="start.npz.*--fresh"):
+        Trainer(data, Recipe.from_dict(STARTED), tmp_path).prepare()
+
+
+def test_full_batches_are_of_all_frames(tmp_path):
+    recipe = Recipe.from_dict({**FREE, "batch": 0, "steps": 3})
+    run = Trainer(sequence()[0], recipe, tmp_path)
+    before = final_loss(run)
+    assert next(iter(run.run()))["loss"] == pytest.approx(before, rel=1e-5)
+
+
+def test_codes_have_a_learning_rate_of_their_own(tmp_path):
+    moved = {}
+    for rate in (1e-3, 1e-1):
+        run = Trainer(
+            sequence()[0], Recipe.from_dict({**FREE, "steps": 3, "code_learning_rate": rate}), tmp_path / str(rate)
+        )
+        before = run.networks.free_codes.weight.detach().clone(), run.networks.decoder[0].weight.detach().clone()
+        through(run)
+        after = run.networks.free_codes.weight, run.networks.decoder[0].weight
+        moved[rate] = [(b - a).abs().max().item() for a, b in zip(before, after)]
+    assert moved[1e-1][0] > 30 * moved[1e-3][0] and moved[1e-1][1] < 3 * moved[1e-3][1]
+
+
+def test_the_auto_decoder_trains_no_shape_encoder(tmp_path):
+    run = Trainer(
+        sequence()[0], Recipe.from_dict({**FREE, "steps": 5, "streams": "decoder", "decay_weight": 1e-4}), tmp_path
+    )
+    before = [weight.clone() for weight in run.networks.shape_encoder.parameters()]
+    rows = [row["recon_ae"] for row in run.run()]
+    assert rows == [0] * 5
+    assert all(torch.equal(a, b) for a, b in zip(before, run.networks.shape_encoder.parameters()))
+
+
+def test_patience_compares_windows_of_steps(tmp_path):
+    run = Trainer(sequence()[0], Recipe.from_dict({**FREE, "patience": 3}), tmp_path)
+    settled = [run._settled(loss) for loss in (9, 5, 4, 1, 7, 9, 5, 5, 6.9, 5.63, 5.63, 5.63)]
+    assert [i for i, stop in enumerate(settled) if stop] == [11]  # means 6, 5.667, 5.633, 5.630
+
+
+def test_a_settled_run_stops_and_stays_so(tmp_path):
+    recipe = Recipe.from_dict(
+        {**FREE, "steps": 50, "batch": 0, "patience": 5, "learning_rate": 1e-12, "code_learning_rate": 1e-12}
+    )
+    run = through(Trainer(sequence()[0], recipe, tmp_path))
+    assert run.stopped and run.step == 10
+    again = Trainer(sequence()[0], recipe, tmp_path)
+    assert again.resume() and through(again).step == 10
+    with open(tmp_path / "log.csv") as file:
+        assert [row["step"] for row in csv.DictReader(file)] == ["10"]
+
+
+def test_ctrl_c_waits_for_the_step(tmp_path, monkeypatch):
+    """It comes between the weights of a step, and the run continues as if it had not."""
+    data, recipe = sequence()[0], Recipe.from_dict({**FREE, "steps": 6})
+    whole = through(Trainer(data, recipe, tmp_path / "whole"))
+    first = Trainer(data, recipe, tmp_path / "parts")
+    step = first.optimizer.step
+
+    def interrupted():
+        step()
+        if first.step == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(first.optimizer, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        through(first)
+    second = Trainer(data, recipe, tmp_path / "parts")
+    assert second.resume() and second.step == 4
+    assert same_weights(whole, through(second))
+
+
+def test_the_encoder_is_fitted_to_free_codes(tmp_path, searches):
+    recipe = Recipe.from_dict({**STARTED, "regression_steps": 200, "steps": 1, "learning_rate": 3e-3, "width": 64})
+    run = through(Trainer(sequence()[0], recipe, tmp_path))
+    codes = run.networks.free_codes.weight.clone()
+    decoder = [weight.clone() for weight in run.networks.decoder.parameters()]
+    far, near = fit_encoder(run, 1), fit_encoder(run, 400)
+    assert near < 0.7 * far
+    assert torch.equal(codes, run.networks.free_codes.weight)
+    assert all(torch.equal(a, b) for a, b in zip(decoder, run.networks.decoder.parameters()))
+
+
+BAD = {
+    "start": ({"start": "warm"}, "start must be one of"),
+    "solver": ({"solver": "fast"}, "solver must be one of"),
+    "streams": ({"streams": 2}, "streams"),
+    "restarts": ({"restarts": 0}, "restarts"),
+    "patience": ({"patience": -1}, "patience"),
+    "nothing to do": ({"steps": 0}, "nothing is trained"),
+    "start unused": ({"start": "linear"}, "regression_steps"),
+    "mirrored free codes": ({"codes": "free", "mirror_object": True}, "mirror_object needs codes: encoder"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_recipes_that_make_no_sense_are_refused(name):
+    settings, message = BAD[name]
+    with pytest.raises(RecipeError, match=message):
+        Recipe.from_dict(settings)
+
+
+def test_a_recipe_changes_its_base(tmp_path):
+    (tmp_path / "mine.yaml").write_text("base: adl\nbottleneck: 5\n")
+    assert Recipe.load(tmp_path / "mine.yaml") == replace(Recipe.load("adl"), bottleneck=5)
+    for base in ("nothing", "[1]"):
+        (tmp_path / "mine.yaml").write_text(f"base: {base}\n")
+        with pytest.raises(RecipeError, match="base"):
+            Recipe.load(tmp_path / "mine.yaml")
+
+
+def test_the_papers_recipe_is_the_papers():
+    paper = Recipe.load("paper")
+    assert paper.hidden[::-1] == (256, 128, 64, 32, 16) and paper.bottleneck == 8
+    assert (paper.code_weight, paper.decay_weight, paper.solver, paper.start) == (0.01, 1e-4, "algebraic", "random")
+    beyond = (paper.handedness_weight, paper.bone_weight, paper.nuclear_weight, paper.hide, paper.roll)
+    assert not any(beyond) and not paper.mirror_view and not paper.mirror_object
