@@ -326,6 +326,93 @@ def _benchmark_nrsfm(args: argparse.Namespace) -> None:
         print(benchmark.table(report))
 
 
+_STUDIES = {
+    "bottleneck": "error against the size of the bottleneck, K = 2 to 12",
+    "noise": "error against Gaussian noise of the points, as a share of their rms",
+    "hidden": "error against the share of hidden points",
+    "auto_decoder": "PAUL against its decoder alone (ADL) and ADL + low rank, as bars",
+    "latent": "latent spaces of two dimensions, coloured by frame: PAUL against ADL, own and random cameras",
+}
+_STUDY_EXAMPLES = """\
+FILE is an npz with W and the truth S, as for `paul evaluate`; only W and visible reach the trainer, frames shuffled.
+The folder gets NAME.png and NAME.json; work/ in it keeps the runs, so that an interrupted study goes on.
+
+examples:
+  paul study bottleneck --data drink.npz yoga.npz --seeds 10 -o out/studies
+  paul study hidden --data S5_train.npz --values 0,0.3,0.6 --set codes=encoder -o out/studies
+  paul study latent --data drink.npz pickup.npz -o out/studies
+  paul study interpolation --model person.npz --data person2d.npz --frames 10,250 -o out/studies
+"""
+
+
+def _add_study(commands: argparse._SubParsersAction) -> None:
+    text = dict(epilog=_STUDY_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = commands.add_parser(
+        "study",
+        help="one question about the method, answered by a table and a picture",
+        description="One question about the method, answered by a table and a picture.",
+        **text,
+    )
+    studies = parser.add_subparsers(metavar="NAME", required=True)
+    for name, question in _STUDIES.items():
+        study = studies.add_parser(name, help=question, description=f"{question[0].upper()}{question[1:]}.", **text)
+        _add_study_files(study)
+        if name not in ("auto_decoder", "latent"):
+            study.add_argument("--values", metavar="A,B", type=_numbers, default=(), help="to try instead of its own")
+        _add_runs(study, None)
+        study.set_defaults(run=_study, study=name, values=())
+    question = "shapes on the line between two codes of a model"
+    strip = studies.add_parser("interpolation", help=question, description=f"{question.capitalize()}.", **text)
+    _add_study_files(strip)
+    strip.add_argument("--model", required=True, help="model file, or the name of a shipped model")
+    strip.add_argument("--frames", metavar="A,B", type=_two_frames, help="default: those whose codes differ most")
+    strip.set_defaults(run=_interpolation)
+
+
+def _add_study_files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", metavar="FILE", type=Path, nargs="+", required=True, help="npz with W and S")
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for table, picture, runs")
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if not values or min(values) < 0 or len(set(values)) < len(values):
+        raise argparse.ArgumentTypeError(f"'{text}' is no list of different numbers, as in 0,0.3")
+    return values
+
+
+def _two_frames(text: str) -> tuple[int, int]:
+    words = text.split(",")
+    if len(words) != 2 or words[0] == words[1]:
+        raise argparse.ArgumentTypeError(f"'{text}' is not two frames, as in 10,250")
+    return _natural(words[0]), _natural(words[1])
+
+
+def _study(args: argparse.Namespace) -> None:
+    from paul_ros.bag import check_outputs
+
+    check_outputs([args.output / f"{args.study}.{kind}" for kind in ("json", "png")], args.data)
+    with _training_packages():
+        from training.studies import study
+    keeping = _keeping(args, args.output / "work")
+    print(
+        study.run(
+            study.studies()[args.study], args.data, args.output, args.seeds, tuple(args.values), args.set, keeping
+        )
+    )
+
+
+def _interpolation(args: argparse.Namespace) -> None:
+    from paul_ros.bag import check_outputs
+    from training.studies import interpolation
+
+    check_outputs([args.output / f"interpolation.{kind}" for kind in ("json", "png")], [args.model, *args.data])
+    print(interpolation.run(args.model, args.data, args.output, args.frames))
+
+
 _EVALUATE_EXAMPLES = """\
 DATA is an npz with
   W (F,2,P)        image points, y down; one scale for S and W
@@ -423,6 +510,7 @@ def _parser(train: bool) -> argparse.ArgumentParser:
     _add_inspect(commands)
     _add_train(commands, train)
     _add_evaluate(commands)
+    _add_study(commands)
     _add_demo(commands)
     _add_benchmark(commands)
     return parser
@@ -478,7 +566,7 @@ def _is_expected(error: Exception) -> bool:
     from paul_ros.skeleton import LayoutError
 
     expected: tuple = (BagError, DemoError, ImportError, LayoutError, ModelError, OSError, PictureError)
-    for module in ("training.cli", "training.evaluation", "training.experiments"):
+    for module in ("training.cli", "training.evaluation", "training.experiments", "training.studies.interpolation"):
         if module in sys.modules:
             expected += sys.modules[module].ERRORS
     return isinstance(error, expected)

@@ -49,7 +49,7 @@ class Run:
         method: a name of RECIPES, or a recipe by name or file.
         seed: of training and of the frames' order.
         settings: overrides of the recipe, as ``--set`` takes them.
-        detail: what sets the run apart from others of its series, for people.
+        detail: what sets the run apart from others of its series, for people; value: the same, to sort by.
     """
 
     sequence: Sequence
@@ -57,6 +57,7 @@ class Run:
     seed: int
     settings: tuple[str, ...] = ()
     detail: str = ""
+    value: float | str = ""
 
     def recipe(self) -> Recipe:
         """Its recipe; raises RecipeError. A recipe that trains several runs itself has seeds of its own in each."""

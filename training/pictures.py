@@ -55,6 +55,12 @@ def save_figure(figure: Any, path: str | Path) -> None:
     write_atomically(path, buffer.getvalue())
 
 
+def between(share: float) -> tuple[float, ...]:
+    """A colour from blue, share 0, to red, share 1."""
+    blue, red = np.array([0.12, 0.47, 0.82]), np.array([0.84, 0.15, 0.16])
+    return tuple((1 - share) * blue + share * red)
+
+
 def titled(ax: Any, title: str) -> None:
     """A panel's title, at the left."""
     ax.set_title(title, loc="left", fontweight="bold", fontsize=11)
@@ -75,14 +81,22 @@ def percent_axis(ax: Any, label: str = "normalised error, %") -> None:
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     ax.set_yscale("log")
-    low, high = ax.get_ylim()
-    ticks = [m * 10.0**e for e in range(-4, 5) for m in (1, 2, 5)]
-    ax.yaxis.set_major_locator(FixedLocator([tick for tick in ticks if low <= tick <= high]))
+    ax.yaxis.set_major_locator(FixedLocator(_ticks(*ax.get_ylim())))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ax.yaxis.set_minor_locator(NullLocator())
     ax.set_ylabel(label)
     ax.grid(axis="y", color="#ececec", zorder=0)
     ax.set_axisbelow(True)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers between two limits, as many as can be read."""
+    for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7), np.arange(1, 10, 0.2)):
+        ticks = [round(step * 10.0**power, 6) for power in range(-4, 5) for step in steps]
+        inside = [tick for tick in ticks if low <= tick <= high]
+        if len(inside) >= 4:
+            break
+    return inside[:: 1 + len(inside) // 12]
 
 
 def turned_view(S: np.ndarray) -> np.ndarray:
