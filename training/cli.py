@@ -34,8 +34,21 @@ ERRORS = (BagError, DataError, RecipeError, TrainingError, ModelError, LayoutErr
 """What a user can cause and mend; the text of each is one clear line."""
 
 
+_EXAMPLES = """\
+examples:
+  paul train recording.mcap -o hand.npz --layout hand.yaml --set bottleneck=6
+  paul train sequence.npz --recipe nrsfm --shapes shapes.npz        3D shapes of these very frames
+  paul train views.npz -o model.npz --set restarts=4                the run of the lowest final loss is kept
+  torchrun --nproc-per-node 4 --no-python paul train views.npz -o model.npz
+
+The run is kept in MODEL.run (or SHAPES.run): checkpoint.pt, log.csv and, if the recipe looks for one, start.npz.
+Stopped at any time, the same command continues it, to the bit. Several processes train as one does, but for rounding.
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
+    parser.epilog, parser.formatter_class = _EXAMPLES, argparse.RawDescriptionHelpFormatter
     parser.add_argument(
         "data",
         metavar="DATA",

@@ -18,7 +18,7 @@ from paul_ros.files import write_atomically
 from paul_ros.metrics import procrustes
 from paul_ros.skeleton import Layout
 from training.distributed import from_first
-from training.networks import to_unit_size
+from training.networks import to_centre, to_unit_size
 
 START = "start.npz"
 
@@ -127,8 +127,7 @@ class Lesson:
 
     def __init__(self, start: Start, layout: Layout, scale: str, device: torch.device) -> None:
         shapes = torch.from_numpy(start.shapes).to(device) * START_UNIT[scale]
-        shapes = shapes - shapes.mean(2, keepdim=True)
-        self._shapes = to_unit_size(shapes, layout) if scale == "free" else shapes
+        self._shapes = to_unit_size(shapes, layout) if scale == "free" else to_centre(shapes, layout)
         self._symmetry = torch.from_numpy(symmetry(start.shapes, layout)).to(device)
         self._mirror = list(layout.mirror)
         self.rows = torch.from_numpy(start.rows)
