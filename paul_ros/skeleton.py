@@ -119,8 +119,12 @@ class Layout:
     @cached_property
     def parts(self) -> tuple[Part, ...]:
         """The categories; one part of all points where there are none."""
-        every = self.categories.values() or [tuple(range(len(self.names)))]
-        return tuple(Part(points, tuple(edge for edge in self.edges if set(edge) <= set(points))) for points in every)
+        if not self.categories:
+            return (Part(tuple(range(len(self.names))), self.edges),)
+        own = [(points, set(points)) for points in self.categories.values()]
+        return tuple(
+            Part(points, tuple(edge for edge in self.edges if found.issuperset(edge))) for points, found in own
+        )
 
     @property
     def sides(self) -> tuple[str, ...]:
