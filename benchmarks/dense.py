@@ -4,9 +4,9 @@
 
     python benchmarks/dense.py [--points 6890] [--frames 5000] [--epochs 3] [--set KEY=VALUE ...]
 
-Memory is that of the whole command, from reading the file to writing the model and the shapes of all frames: the largest
-resident set of the process, as the kernel counts it.  An epoch is as many steps as show each frame once on average; beside its time
-by the clock stands the processor time of the whole command, for machines that have other things to do.
+Memory is that of the whole command, from reading the file to writing the model and the shapes of all frames: the
+largest resident set of the process, as the kernel counts it.  An epoch is as many steps as show each frame once on
+average; beside its time by the clock stands the processor time of the whole command, for machines with other work.
 """
 
 from __future__ import annotations
