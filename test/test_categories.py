@@ -14,11 +14,13 @@ from paul_ros.lifter import TOO_FEW_POINTS, Lifter
 from paul_ros.model import load_model
 from paul_ros.skeleton import Layout, anonymous_layout
 from training import cli
-from training.categories import joint_layout, load_files
+from training.categories import among_categories, joint_layout, load_files
 from training.data import DataError
+from training.evaluation import evaluate_model
 from training.networks import build_networks
 from training.objective import Views, own_points, paul_terms
 from training.recipe import Recipe
+from training.truth import load_sequence
 
 SMALL = [word for item in ("steps=8", "width=16", "batch=8", "bottleneck=3") for word in ("--set", item)]
 
@@ -168,3 +170,19 @@ def test_data_without_a_layout_just_trains(tmp_path):
     assert layout.name == "points41" and layout.names[0] == "p00"
     with pytest.raises(DataError, match="points41.*--layout"):
         train(write(tmp_path / "other.npz", 40), "-o", tmp_path / "o.npz", "--layout", "points41")
+
+
+def test_a_category_is_judged_by_its_own_points(garage, tmp_path):
+    train(*garage, "-o", tmp_path / "m.npz")
+    with np.load(garage[0]) as archive:
+        W = archive["W"].astype(float)
+    S = np.concatenate([W, W[:, :1]], axis=1)
+    np.savez(garage[0], W=W, S=S)
+    truth = among_categories(load_sequence(garage[0]), load_model(tmp_path / "m.npz").layout)
+    assert truth.present.tolist() == truth.visible.tolist() == load_files(garage).visible[:20].tolist()
+    np.testing.assert_array_equal(truth.S[:, :, :7], S)
+    report, compared = evaluate_model(tmp_path / "m.npz", garage[0])
+    assert report["frames"] == 20 and np.isfinite(report["ne_flip_frame_percent"])
+    np.savez(tmp_path / "van.npz", W=W, S=S)
+    with pytest.raises(DataError, match="7 points.*90"):
+        evaluate_model(tmp_path / "m.npz", tmp_path / "van.npz")

@@ -8,7 +8,7 @@ cost nothing.  Which category a frame is of, the networks see from the visibilit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,11 @@ import numpy as np
 from paul_ros.parameters import DEFAULTS
 from paul_ros.skeleton import Layout
 from training.data import DataError, TrainingData, load_training_data
+from training.truth import Sequence
 
 
 def load_files(
-    paths: Sequence[str | Path],
+    paths: list[str | Path],
     layout: Layout | None = None,
     topic: str | None = None,
     min_confidence: float = DEFAULTS["min_confidence"],
@@ -50,14 +51,14 @@ def load_files(
     return side_by_side(names, parts)
 
 
-def one_after_another(parts: Sequence[TrainingData]) -> TrainingData:
+def one_after_another(parts: list[TrainingData]) -> TrainingData:
     """All frames of data of one layout."""
     W = np.concatenate([part.W for part in parts])
     visible = np.concatenate([part.visible for part in parts])
     return _joined(parts, W, visible, parts[0].layout)
 
 
-def side_by_side(names: Sequence[str], parts: Sequence[TrainingData]) -> TrainingData:
+def side_by_side(names: list[str], parts: list[TrainingData]) -> TrainingData:
     """All frames of data of several categories, in the joint layout of all their points: the others' are hidden."""
     layout = joint_layout(names, [part.layout for part in parts])
     frames, points = sum(len(part.W) for part in parts), len(layout.names)
@@ -70,7 +71,7 @@ def side_by_side(names: Sequence[str], parts: Sequence[TrainingData]) -> Trainin
     return _joined(parts, W, visible, layout)
 
 
-def joint_layout(names: Sequence[str], layouts: Sequence[Layout]) -> Layout:
+def joint_layout(names: list[str], layouts: list[Layout]) -> Layout:
     """The points of several layouts side by side, category by category, each named ``category.point``.
 
     Raises:
@@ -86,6 +87,22 @@ def joint_layout(names: Sequence[str], layouts: Sequence[Layout]) -> Layout:
     return Layout.from_dict({"name": "+".join(names), **joint, "root": joint["names"], "categories": categories})
 
 
+def among_categories(truth: Sequence, layout: Layout) -> Sequence:
+    """A file of one category, named like it, in the joint layout: the others' points are hidden, their truth unknown.
+
+    Any other file as it is.
+    """
+    points = layout.categories.get(truth.name, ())
+    if truth.W.shape[2] != len(points):
+        return truth
+    points, frames, every = list(points), len(truth.W), len(layout.names)
+    W, visible = np.zeros((frames, 2, every)), np.zeros((frames, every), bool)
+    S = np.full((frames, 3, every), np.nan)
+    W[:, :, points], visible[:, points], S[:, :, points] = truth.W, truth.visible, truth.S
+    edges = np.array(points)[truth.edges] if len(truth.edges) else truth.edges
+    return replace(truth, W=W, visible=visible, S=S, edges=edges)
+
+
 def _prefixed(item: object, prefix: str) -> object:
     """A layout's lists with every point's name prefixed."""
     if isinstance(item, str):
@@ -95,7 +112,7 @@ def _prefixed(item: object, prefix: str) -> object:
     return [_prefixed(value, prefix) for value in item]
 
 
-def _joined(parts: Sequence[TrainingData], W: np.ndarray, visible: np.ndarray, layout: Layout) -> TrainingData:
+def _joined(parts: list[TrainingData], W: np.ndarray, visible: np.ndarray, layout: Layout) -> TrainingData:
     return TrainingData(
         W,
         visible,

@@ -18,6 +18,7 @@ from paul_ros.lifter import AMBIGUOUS, DEGENERATE_POINTS, TOO_FEW_POINTS
 from paul_ros.model import Model, load_model
 from paul_ros.onp import onp
 from paul_ros.replay import versions
+from training.categories import among_categories
 from training.data import DataError
 from training.truth import Sequence, load_sequence
 
@@ -93,7 +94,8 @@ def evaluate_model(
         DataError: the file has no truth, or other points than the model.
         ModelError: the model cannot be used.
     """
-    model, truth = load_model(model_name), load_sequence(data)
+    model = load_model(model_name)
+    truth = among_categories(load_sequence(data), model.layout)
     if len(model.layout.names) != truth.W.shape[2]:
         raise DataError(
             f"'{data}' has {truth.W.shape[2]} points, model '{model_name}' has {len(model.layout.names)}: "
