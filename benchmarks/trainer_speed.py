@@ -1,0 +1,145 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Frames per second of the trainer, beside the same model written down plainly in eager torch with an SVD.
+
+    python benchmarks/trainer_speed.py [--rounds 30] [--threads 1] [--json FILE]
+
+The twin is what one writes from the paper: the same networks, weights, batches, losses and Adam, the camera by least
+squares and torch.linalg.svd with its gradients (section 4.2), nothing fused or batched by hand, no log. The trainer is
+``training.trainer.Trainer`` as it is, exact cameras, log and all. Both take turns in rounds of ten steps, so that they
+see the same machine; the ratio is the median of the rounds'. Views: shapes of the shipped human model (17 points) from
+random sides, all of one scale.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from paul_ros.files import write_atomically
+from paul_ros.model import load_model
+from training.data import TrainingData
+from training.networks import build_networks
+from training.recipe import Recipe
+from training.trainer import Trainer
+from training.truth import random_rotations
+
+STEPS = 10  # of each in a round
+FRAMES = 4000
+MODES = {"free codes": [], "2D encoder": ["codes=encoder"]}
+
+
+def views() -> TrainingData:
+    """Image points of FRAMES frames, all visible."""
+    rng, model = np.random.default_rng(0), load_model()
+    S = random_rotations(FRAMES, 0) @ model.decode(0.3 * rng.standard_normal((FRAMES, model.header["bottleneck"])))
+    visible = np.ones((FRAMES, S.shape[2]), bool)
+    return TrainingData(np.ascontiguousarray(S[:, :2], np.float32), visible, model.layout, False, "made", 0)
+
+
+class Twin:
+    """The paper's method as one would write it down, for views of one scale of which every point is seen."""
+
+    def __init__(self, data: TrainingData, recipe: Recipe) -> None:
+        torch.manual_seed(recipe.seed)
+        self.recipe = recipe
+        self.networks = build_networks(data.layout, recipe, len(data.W))
+        self.W = torch.from_numpy(data.W / data.image_unit)
+        self.W = self.W - self.W.mean(2, keepdim=True)
+        self.visible = torch.from_numpy(data.visible)
+        codes = recipe.codes == "free"
+        used = [p for name, p in self.networks.named_parameters() if not (codes and name.startswith("encoder."))]
+        self.adam = torch.optim.Adam(used, lr=recipe.learning_rate)
+
+    def step(self) -> float:
+        """One step; returns its loss."""
+        loss = self.loss(torch.randint(len(self.W), (self.recipe.batch,)))
+        self.adam.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.networks.parameters(), self.W.shape[2] ** 0.5)
+        self.adam.step()
+        return loss.item()
+
+    def loss(self, rows: Tensor) -> Tensor:
+        """The paper's equation 7 of some frames (N,)."""
+        W, visible = self.W[rows], self.visible[rows]
+        code = self.networks.codes(W, visible, rows)
+        ad = self.networks.decoder(code)
+        ae = self.networks.decoder(self.networks.shape_encoder(ad))
+        R = self.camera(ad, ae, W)
+        z = (R[:, 2:] @ (ad + ae)) / 2
+        target = R.transpose(1, 2) @ torch.cat([W, z], dim=1)
+        loss = torch.linalg.matrix_norm(ae - target).mean() + torch.linalg.matrix_norm(ad - target).mean()
+        loss = loss + self.recipe.code_weight * code.square().sum(1).mean()
+        for weight in self.networks.decoder.parameters():
+            loss = loss + self.recipe.decay_weight * weight.square().sum()
+        return loss
+
+    @staticmethod
+    def camera(ad: Tensor, ae: Tensor, W: Tensor) -> Tensor:
+        """Steps 1 and 2 of the paper's solver: least squares for both streams, then the nearest rotation by SVD."""
+        S = torch.cat([ae, ad], dim=2)
+        M = torch.linalg.lstsq(S.transpose(1, 2), torch.cat([W, W], dim=2).transpose(1, 2)).solution
+        U, _, Vt = torch.linalg.svd(M.transpose(1, 2), full_matrices=False)
+        Q = U @ Vt
+        return torch.cat([Q, torch.linalg.cross(Q[:, 0], Q[:, 1])[:, None]], dim=1)
+
+
+def timed(step: Callable[[], object]) -> float:
+    """Seconds of a step."""
+    begun = time.perf_counter()
+    for _ in range(STEPS):
+        step()
+    return (time.perf_counter() - begun) / STEPS
+
+
+def measure(mode: str, batch: int, rounds: int) -> dict:
+    """Frames per second of both, and the ratio of their times."""
+    steps = STEPS * (rounds + 2)
+    settings = [f"steps={steps}", f"batch={batch}", "start=random", "regression_steps=0", *MODES[mode]]
+    recipe, data = Recipe.load("nrsfm", settings), views()
+    with tempfile.TemporaryDirectory() as folder:
+        twin, run = Twin(data, recipe), Trainer(data, recipe, Path(folder)).run()
+        times = []
+        for number in range(rounds + 1):
+            pair = timed(lambda: next(run)), timed(twin.step)
+            times += [pair] if number else []  # the first warms up
+        run.close()
+    ours, plain = np.array(times).T
+    return {
+        "mode": mode,
+        "batch": batch,
+        "frames_per_second": float(batch / np.median(ours)),
+        "twin_frames_per_second": float(batch / np.median(plain)),
+        "speed_ratio": float(np.median(plain / ours)),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=30, help="of ten steps of either (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the rows as JSON")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    rows = [measure(mode, batch, args.rounds) for mode in MODES for batch in (128, 256)]
+    if args.json:
+        write_atomically(args.json, json.dumps({"rows": rows, "threads": args.threads}, indent=1).encode())
+    print("| codes | batch | trainer, frames/s | plain twin, frames/s | ratio |\n|---|---|---|---|---|")
+    for row in rows:
+        print(
+            f"| {row['mode']} | {row['batch']} | {row['frames_per_second']:.0f} | "
+            f"{row['twin_frames_per_second']:.0f} | {row['speed_ratio']:.2f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()
