@@ -16,6 +16,7 @@ from paul_ros.model import load_model, save_model
 from paul_ros.skeleton import load_layout
 from training import evaluation
 from training.data import DataError
+from training.reconstruction import Reconstruction
 from training.truth import Sequence, load_sequence, random_rotations
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -299,3 +300,55 @@ def test_mean_shape_of_one_shape_in_many_poses_is_that_shape():
     mean = evaluation.rigid_mean(random_rotations(20, 0) @ shape * np.linspace(1, 3, 20)[:, None, None])
     assert metrics.pa_mpjpe(mean.T[None], shape.T[None])[0] == pytest.approx(0, abs=1e-12)
     assert np.sqrt((mean**2).sum(0).mean()) == pytest.approx(1)
+
+
+# --- saved reconstructions
+
+
+def saved(path, S):
+    turn = random_rotations(len(S), 7)
+    Reconstruction(S.astype(np.float32), turn.astype(np.float32), None, 0.5, 12.0).save(path)
+    return str(path)
+
+
+def evaluate_saved(path, data, tmp_path):
+    words = ["evaluate", str(path), "--truth", str(data), "--json", str(tmp_path / "e.json")]
+    assert cli.main(words) == 0
+    return json.loads((tmp_path / "e.json").read_text())
+
+
+def test_a_saved_reconstruction_is_judged_frame_by_frame(tmp_path):
+    made = sequence()
+    truth = made.S - made.S.mean(2, keepdims=True)
+    data = write(tmp_path / "d.npz", made.S)
+    exact = evaluate_saved(saved(tmp_path / "a.npz", truth), data, tmp_path)
+    assert exact["ne_flip_global_percent"] < 1e-4 and exact["loss"] == 0.5 and exact["seconds"] == 12.0
+    deeper = evaluate_saved(saved(tmp_path / "b.npz", truth * [[1], [1], [1.1]]), data, tmp_path)
+    share = np.linalg.norm(0.1 * truth[:, 2], axis=1) / np.linalg.norm(truth, axis=(1, 2))
+    assert deeper["ne_flip_frame_percent"] == pytest.approx(100 * share.mean(), rel=1e-4)
+    some_mirrored = truth.copy()
+    some_mirrored[:10, 2] *= -1
+    mixed = evaluate_saved(saved(tmp_path / "c.npz", some_mirrored), data, tmp_path)
+    assert mixed["flipped_share"] == pytest.approx(1 / 3) and mixed["ne_flip_frame_percent"] < 1e-4
+    assert mixed["ne_flip_global_percent"] > 10
+
+
+def test_the_baseline_of_a_reconstruction_is_its_rigid_mean(tmp_path):
+    """Of one shape in many poses it is that shape; of many shapes it is far from them."""
+    shape = np.random.default_rng(0).standard_normal((3, 20))
+    shape -= shape.mean(1, keepdims=True)
+    R = random_rotations(30, 7)
+    rigid = evaluate_saved(saved(tmp_path / "a.npz", R @ shape), write(tmp_path / "d.npz", R @ shape), tmp_path)
+    assert rigid["baseline"]["ne_flip_frame_percent"] < 1e-3
+    varied = R @ (shape + 0.3 * np.random.default_rng(1).standard_normal((30, 3, 20)))
+    other = evaluate_saved(saved(tmp_path / "b.npz", varied), write(tmp_path / "v.npz", varied), tmp_path)
+    assert other["baseline"]["ne_flip_frame_percent"] > 10 > other["ne_flip_frame_percent"]
+
+
+def test_a_reconstruction_of_other_frames_is_refused(tmp_path, capsys):
+    made = sequence()
+    data = write(tmp_path / "d.npz", made.S)
+    assert cli.main(["evaluate", saved(tmp_path / "a.npz", made.S[:-1]), "--truth", str(data)]) == 1
+    assert "that was reconstructed" in capsys.readouterr().err
+    assert cli.main(["evaluate", str(data), "--truth", str(data)]) == 1
+    assert "no saved reconstruction" in capsys.readouterr().err
