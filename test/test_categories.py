@@ -182,7 +182,7 @@ def test_a_category_is_judged_by_its_own_points(garage, tmp_path):
     assert truth.present.tolist() == truth.visible.tolist() == load_files(garage).visible[:20].tolist()
     np.testing.assert_array_equal(truth.S[:, :, :7], S)
     report, compared = evaluate_model(tmp_path / "m.npz", garage[0])
-    assert report["frames"] == 20 and np.isfinite(report["ne_flip_frame_percent"])
+    assert report["frames"] == 20 and report["hidden_share"] == 0 and np.isfinite(report["ne_flip_frame_percent"])
     np.savez(tmp_path / "van.npz", W=W, S=S)
     with pytest.raises(DataError, match="7 points.*90"):
         evaluate_model(tmp_path / "m.npz", tmp_path / "van.npz")

@@ -215,7 +215,7 @@ def _report(compared: Comparison, **about: object) -> dict:
         "persons": len(truth.W),
         "judged": len(rows),
         "dropped": dict(zip(reasons.tolist(), counts.tolist())),
-        "hidden_share": float(1 - visible.mean()),
+        "hidden_share": float(1 - visible[truth.present[rows]].mean()),
         "whole_set_mirrored": compared.mirrored,
         "n_mpjpe_mm": None,
         "pa_mpjpe_mm": None,
