@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from tiny_data import sequence, true_start
 
 from paul_ros.onp import onp
@@ -16,7 +17,7 @@ from training import starting, trainer
 from training.encoder_fit import fit_encoder
 from training.recipe import Recipe, RecipeError
 from training.reconstruction import final_loss
-from training.trainer import Trainer, TrainingError
+from training.trainer import Trainer, TrainingError, rule_share
 
 COCO = load_layout("coco17")
 TINY = {
@@ -119,6 +120,7 @@ def test_a_start_is_of_the_chirality_that_the_layout_asks_for(tmp_path, monkeypa
         run = Trainer(data, Recipe.from_dict(STARTED), tmp_path / str(len(kept)))
         run.prepare()
         kept.append(run.start)
+        assert rule_share(run.start.shapes, COCO) > 0.5
     np.testing.assert_allclose(kept[0].shapes, kept[1].shapes, atol=1e-6)
     np.testing.assert_allclose(kept[0].rotations, kept[1].rotations, atol=1e-6)
 
@@ -139,6 +141,33 @@ def test_a_mirrored_object_has_a_mirrored_shape(tmp_path):
     W = (camera[:, :2] * [[-1], [1]])[:, :, COCO.mirror] / data.image_unit
     found = onp(S, W, data.visible, "unit")
     assert found.residual.max() < 1e-6
+
+
+def test_a_symmetric_object_mirrored_is_itself():
+    """And keeps its chirality and its place in the canonical frame."""
+    S = np.random.default_rng(0).standard_normal((3, 17))
+    S = S + np.diag([-1, 1, 1]) @ S[:, COCO.mirror]
+    S = Rotation.random(random_state=0).as_matrix() @ (S - S.mean(1, keepdims=True))
+    start = starting.Start(
+        np.arange(4), np.repeat(S[None], 4, 0).astype(np.float32), np.repeat(np.eye(3)[None], 4, 0), 0, 0
+    )
+    lesson = starting.Lesson(start, COCO, "unit", torch.device("cpu"))
+    plain, mirrored = (lesson.shapes_of(torch.arange(4), flag.expand(4, 1, 1)) for flag in torch.tensor([False, True]))
+    torch.testing.assert_close(plain, mirrored, rtol=0, atol=1e-5)
+
+
+def test_turned_views_are_rotations_or_their_mirror_images():
+    turn, facing = trainer.turned_views(torch.linspace(0, 6, 8), torch.arange(8) % 2 == 0)
+    torch.testing.assert_close(turn @ turn.mT, torch.eye(2).expand(8, 2, 2), rtol=0, atol=1e-6)
+    torch.testing.assert_close(torch.linalg.det(turn), facing[:, 0, 0])
+    assert facing[:, 0, 0].tolist() == [-1, 1] * 4
+
+
+def test_the_gradient_limit_grows_with_the_norms(tmp_path, monkeypatch):
+    limits = []
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda weights, limit: limits.append(limit))
+    through(Trainer(sequence(layout=COCO)[0], Recipe.from_dict({**FREE, "steps": 1}), tmp_path))
+    assert limits == [pytest.approx(17**0.5)]
 
 
 @pytest.mark.parametrize("damage", ["junk", "other data"])
@@ -197,6 +226,9 @@ def test_a_settled_run_stops_and_stays_so(tmp_path):
     assert run.stopped and run.step == 10
     again = Trainer(sequence()[0], recipe, tmp_path)
     assert again.resume() and through(again).step == 10
+    until(Trainer(sequence()[0], recipe, tmp_path / "parts"), 7)
+    parts = Trainer(sequence()[0], recipe, tmp_path / "parts")
+    assert parts.resume() and through(parts).step == 10
     with open(tmp_path / "log.csv") as file:
         assert [row["step"] for row in csv.DictReader(file)] == ["10"]
 

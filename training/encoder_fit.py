@@ -7,7 +7,7 @@ import math
 
 import torch
 
-from training.trainer import Trainer
+from training.trainer import Trainer, turned_views
 
 STEPS = 3000
 _BATCH = 128
@@ -28,9 +28,8 @@ def fit_encoder(trainer: Trainer, steps: int = STEPS) -> float:
     for step in range(steps):
         adam.param_groups[0]["lr"] = _LEARNING_RATE * 0.5 * (1 + math.cos(math.pi * step / steps))
         rows = torch.randint(len(trainer.data.W), (_BATCH,), generator=generator).to(device)
-        angle = (2 * math.pi * torch.rand(_BATCH, generator=generator)).to(device)
-        facing = torch.where(torch.rand(_BATCH, generator=generator) < 0.5, -1.0, 1.0).to(device)
-        turn = torch.stack([angle.cos() * facing, -angle.sin(), angle.sin() * facing, angle.cos()], 1).view(-1, 2, 2)
+        angle, chance = torch.rand(2, _BATCH, generator=generator).to(device)
+        turn, _ = turned_views(2 * math.pi * angle, chance < 0.5)
         views = trainer.views(rows)
         with torch.no_grad():
             goal = networks.decoder(networks.codes(views.W, views.visible, rows))

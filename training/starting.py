@@ -126,7 +126,7 @@ class Lesson:
     """Canonical shapes of a start that the networks learn to give."""
 
     def __init__(self, start: Start, layout: Layout, scale: str, device: torch.device) -> None:
-        shapes = torch.from_numpy(start.shapes).to(device) * START_UNIT[scale]
+        shapes = torch.from_numpy(start.shapes).to(device)
         self._shapes = to_unit_size(shapes, layout) if scale == "free" else to_centre(shapes, layout)
         self._symmetry = torch.from_numpy(symmetry(start.shapes, layout)).to(device)
         self._mirror = list(layout.mirror)

@@ -342,12 +342,8 @@ class Trainer:
         """
         strength = self._strength()
         angle = (2 * self._uniform(size) - 1) * self.recipe.roll * strength
-        cos, sin = angle.cos(), angle.sin()
-        turn = torch.stack([torch.stack([cos, -sin], 1), torch.stack([sin, cos], 1)], 1)
         mirrored = self._uniform(size) < (0.5 * strength if self.recipe.mirror_view else 0.0)
-        facing = torch.where(mirrored, -1.0, 1.0)[:, None]
-        turn[:, 0] *= facing
-        return turn, facing[:, None]
+        return turned_views(angle, mirrored)
 
     def _strength(self) -> float:
         """Of the view augmentations: 1 before the fade, 0 after it."""
@@ -377,6 +373,15 @@ class Trainer:
                 f"'{self.folder}' holds a run with another {' and '.join(other)}: "
                 f"start over with --fresh, or choose another output"
             )
+
+
+def turned_views(angle: Tensor, mirrored: Tensor) -> tuple[Tensor, Tensor]:
+    """Turns by angles (N,) in the image plane, then mirrored in x where asked (N,): (N,2,2), and facing (N,1,1)."""
+    cos, sin = angle.cos(), angle.sin()
+    turn = torch.stack([torch.stack([cos, -sin], 1), torch.stack([sin, cos], 1)], 1)
+    facing = torch.where(mirrored, -1.0, 1.0)[:, None]
+    turn[:, 0] *= facing
+    return turn, facing[:, None]
 
 
 @torch.no_grad()
