@@ -303,9 +303,11 @@ def _share(text: str) -> float:
 
 def _benchmark_nrsfm(args: argparse.Namespace) -> None:
     from paul_ros.bag import check_outputs
+    from paul_ros.benchmarks import need
     from paul_ros.report import write_json
 
     check_outputs([args.json, args.plot], args.data.glob("*.npz"))
+    need("tqdm", *(["matplotlib"] if args.plot else []))
     with _training_packages():
         from training import benchmark
     report = benchmark.run(
@@ -393,8 +395,10 @@ def _two_frames(text: str) -> tuple[int, int]:
 
 def _study(args: argparse.Namespace) -> None:
     from paul_ros.bag import check_outputs
+    from paul_ros.benchmarks import need
 
     check_outputs([args.output / f"{args.study}.{kind}" for kind in ("json", "png")], args.data)
+    need("tqdm", "matplotlib")
     with _training_packages():
         from training.studies import study
     keeping = _keeping(args, args.output / "work")
@@ -450,11 +454,14 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
 
 def _evaluate(args: argparse.Namespace) -> None:
     from paul_ros.bag import check_outputs
+    from paul_ros.benchmarks import need
     from paul_ros.report import write_json
 
     if (args.data is None) == (args.truth is None):
         args.usage_error("name DATA for a model, or --truth DATA for saved shapes")
     check_outputs([args.json, args.plot], [args.model, args.data, args.truth])
+    if args.plot:
+        need("matplotlib")
     with _training_packages():
         from training import evaluation
     if args.truth:

@@ -93,21 +93,26 @@ def normalised_error_o3(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.linalg.norm(aligned - truth, axis=(1, 2)) / size[:, 0, 0]
 
 
+def normalised_error_of_signs(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """(N,2) NE of every prediction as it is and with its depth flipped."""
+    return np.stack([normalised_error(points, truth) for points in (predicted, flip_depth(predicted))], axis=1)
+
+
 def normalised_error_flip_frame(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """NE, the depth of every single prediction flipped where that lowers its error."""
-    return np.minimum(normalised_error(predicted, truth), normalised_error(flip_depth(predicted), truth))
+    return normalised_error_of_signs(predicted, truth).min(1)
 
 
 def normalised_error_flip_global(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """NE with one flip for the whole set, the one that gives the lower mean: mixed mirror signs show here."""
-    plain, flipped = normalised_error(predicted, truth), normalised_error(flip_depth(predicted), truth)
-    return plain if plain.mean() <= flipped.mean() else flipped
+    signs = normalised_error_of_signs(predicted, truth)
+    return signs[:, signs.mean(0).argmin()]
 
 
-def flipped_share(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Share of frames mirrored against the rest, 0 to 0.5: those whose depth must be flipped to lower their NE.
+def flipped_share(signs: np.ndarray) -> float:
+    """Share of frames mirrored against the rest, 0 to 0.5, from their NE of both signs (N,2).
 
     Which of the two mirror images a whole set is, is open under an orthographic camera; the rarer sign counts.
     """
-    flipped = (normalised_error(flip_depth(predicted), truth) < normalised_error(predicted, truth)).mean()
+    flipped = (signs[:, 1] < signs[:, 0]).mean()
     return float(min(flipped, 1 - flipped))

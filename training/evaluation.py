@@ -31,6 +31,7 @@ LEAST_VISIBLE = 4
 _BLOCK = 256  # frames at a time
 _SINGLES = 100  # frames lifted alone, for the time of one
 _MEAN_ROUNDS = 10
+_MEAN_FRAMES = 1000
 
 Progress = Callable[[int], None]
 """Called with the number of frames done since the last call."""
@@ -41,7 +42,7 @@ class Prediction:
     """3D of F frames.
 
     Attributes:
-        S: (F,3,P) camera frame, in units of W, centred on the mean of the visible points.
+        S: (F,3,P) float32, camera frame, in units of W, centred on the mean of the visible points.
         dropped: F slugs, '' where there is a prediction, else why not.
         certified: (F,) the camera is the proven optimum; None where no camera was solved.
         ambiguity: (F,) 0..1, see ``paul_ros.onp``; None where no camera was solved.
@@ -65,7 +66,7 @@ def predict(model: Model, W: np.ndarray, visible: np.ndarray, progress: Progress
         visible: (F,P) bool.
     """
     unit = model.header["image_unit"] if model.scale == "unit" else 1.0
-    S, dropped = np.zeros((len(W), 3, W.shape[2])), np.full(len(W), "", object)
+    S, dropped = np.zeros((len(W), 3, W.shape[2]), np.float32), np.full(len(W), "", object)
     certified, ambiguity = np.zeros(len(W), bool), np.zeros(len(W))
     for begin in range(0, len(W), _BLOCK):
         rows = slice(begin, begin + _BLOCK)
@@ -122,7 +123,7 @@ def evaluate_shapes(shapes: str | Path, truth_file: str | Path) -> tuple[dict, C
             f"'{shapes}' holds shapes {found.shapes.shape}, the truth in '{truth_file}' is {truth.S.shape}: "
             "name the file that was reconstructed"
         )
-    mean = rigid_mean(found.rotations.transpose(0, 2, 1) @ found.shapes)
+    mean = rigid_mean(found.shapes, found.rotations)
     compared = Comparison.of(truth, Prediction(found.shapes, _none_dropped(truth)), _rigid(mean, truth), flip=True)
     return _report(compared, shapes=Path(shapes).name, loss=found.loss, seconds=found.seconds), compared
 
@@ -133,17 +134,24 @@ def _none_dropped(truth: Sequence) -> np.ndarray:
 
 def _rigid(mean: np.ndarray, truth: Sequence) -> Prediction:
     """The mean shape (3,P) put before every camera, with its best scale."""
-    pose = onp(np.broadcast_to(mean, truth.S.shape), truth.W, truth.visible)
-    S = pose.scale[:, None, None] * centred(pose.R @ mean, truth.visible)
-    return Prediction(S, np.where(pose.determined, "", DEGENERATE_POINTS).astype(object))
+    S, dropped = np.zeros(truth.S.shape, np.float32), _none_dropped(truth)
+    for rows in _blocks(np.arange(len(S))):
+        pose = onp(np.broadcast_to(mean, (len(rows), *mean.shape)), truth.W[rows], truth.visible[rows])
+        S[rows] = pose.scale[:, None, None] * centred(pose.R @ mean, truth.visible[rows])
+        dropped[rows] = np.where(pose.determined, "", DEGENERATE_POINTS)
+    return Prediction(S, dropped)
 
 
-def rigid_mean(shapes: np.ndarray) -> np.ndarray:
-    """Generalised Procrustes mean (3,P) of shapes (F,3,P), each of rms size 1."""
-    points = shapes.transpose(0, 2, 1)
+def rigid_mean(shapes: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Generalised Procrustes mean (3,P) of shapes (F,3,P) in their cameras' frames, each of rms size 1.
+
+    Rotations (F,3,3), to the camera frame, say how they first lie on each other; of many shapes some suffice.
+    """
+    rows = np.linspace(0, len(shapes) - 1, min(_MEAN_FRAMES, len(shapes))).astype(int)
+    points = (rotations[rows].transpose(0, 2, 1) @ shapes[rows]).transpose(0, 2, 1).astype(float)
     points = points - points.mean(1, keepdims=True)
     points = points / np.sqrt((points**2).sum(2).mean(1))[:, None, None]
-    mean = points[0]
+    mean = points.mean(0)
     for _ in range(_MEAN_ROUNDS):
         R, _ = metrics.procrustes(points, np.broadcast_to(mean, points.shape))
         mean = np.einsum("nij,npj->pi", R, points) / len(points)
@@ -189,19 +197,24 @@ class Comparison:
         rows = np.flatnonzero(usable)
         if not len(rows):
             raise DataError(f"no frame of '{truth.name}' has {LEAST_VISIBLE} visible points and their truth")
-        predicted, true = _points(found.S, truth, rows), _points(truth.S, truth, rows)
-        plain, other = (
-            metrics.normalised_error(points, true).mean() for points in (predicted, metrics.flip_depth(predicted))
-        )
-        return cls(truth, rows, found, rigid, bool(flip and other < plain))
-
-    def points(self, prediction: Prediction | None = None) -> np.ndarray:
-        """(M,P,3) of a prediction, or of the truth; points without truth are at the mean of the others."""
-        return _points(self.truth.S if prediction is None else prediction.S, self.truth, self.rows)
+        plain, flipped = errors_of_signs(found.S, truth, rows).mean(0)
+        return cls(truth, rows, found, rigid, bool(flip and flipped < plain))
 
 
-def _points(S: np.ndarray, truth: Sequence, rows: np.ndarray) -> np.ndarray:
-    return metrics.fill_absent(S[rows].transpose(0, 2, 1), truth.present[rows])
+def errors_of_signs(S: np.ndarray, truth: Sequence, rows: np.ndarray) -> np.ndarray:
+    """(M,2) normalised errors of shapes (F,3,P), as they are and with the depth flipped, for some frames (M,)."""
+    return np.concatenate([metrics.normalised_error_of_signs(*pair(S, truth, part)) for part in _blocks(rows)])
+
+
+def pair(S: np.ndarray, truth: Sequence, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Predicted and true points (M,P,3) of some frames; those without truth are at the mean of the others."""
+    present = truth.present[rows]
+    return tuple(metrics.fill_absent(some[rows].transpose(0, 2, 1), present) for some in (S, truth.S))
+
+
+def _blocks(rows: np.ndarray) -> list[np.ndarray]:
+    """Frame numbers in parts that fit into memory, however many points a frame has."""
+    return [rows[begin : begin + _BLOCK] for begin in range(0, len(rows), _BLOCK)]
 
 
 def _report(compared: Comparison, **about: object) -> dict:
@@ -223,7 +236,6 @@ def _report(compared: Comparison, **about: object) -> dict:
         "root_error_median_mm": None,
         "root_error_median_percent": None,
         "reprojection_median_px": None,
-        "reprojection_median_percent": _reprojection(truth, found, rows),
         "certified_share": None if found.certified is None else float(found.certified[rows].mean()),
         "ambiguous_share": None if found.ambiguity is None else float((found.ambiguity[rows] >= AMBIGUOUS).mean()),
         "lift_us_median": None,
@@ -239,52 +251,68 @@ def _report(compared: Comparison, **about: object) -> dict:
 def errors(compared: Comparison, prediction: Prediction) -> dict:
     """Every error measure under its exact name, means over the frames; hidden points count in all of them.
 
-    Distances end in ``_mm`` where the truth is in metres, else in ``_units`` (of W). The last two are NE of the visible
-    and of the hidden points alone: the rms distance over them as a share of the whole truth's rms size, depth flipped
-    as in NE with a flip per frame; None where no point is hidden.
+    Distances end in ``_mm`` where the truth is in metres, else in ``_units`` (of W). NE of the visible and of the
+    hidden points alone is None where no point is hidden.
     """
-    predicted, true = compared.points(prediction), compared.points()
-    rows, metres = compared.rows, compared.truth.metres
-    present, visible = compared.truth.present[rows], compared.truth.visible[rows]
-    hidden = present & ~visible
-    share, factor, unit = present.mean(1), 1000.0 if metres else 1.0, "mm" if metres else "units"
-    one_sign = metrics.flip_depth(predicted) if compared.mirrored else predicted
-
-    def mean(values: np.ndarray, factor: float) -> float:
-        return float(factor * values.mean())
-
+    blocks = [_frame_errors(compared, prediction, part) for part in _blocks(compared.rows)]
+    found = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    signs = found["signs"]
+    factor, unit = (1000.0, "mm") if compared.truth.metres else (1.0, "units")
+    some_hidden = bool(np.isfinite(found["hidden"]).any())
     return {
-        "ne_flip_frame_percent": mean(metrics.normalised_error_flip_frame(predicted, true), 100),
-        "ne_flip_global_percent": mean(metrics.normalised_error_flip_global(predicted, true), 100),
-        "ne_o3_percent": mean(metrics.normalised_error_o3(predicted, true), 100),
-        f"mpjpe_flip_frame_{unit}": mean(metrics.mpjpe_flip_frame(predicted, true) / share, factor),
-        f"n_mpjpe_{unit}": mean(metrics.n_mpjpe(one_sign, true) / share, factor),
-        f"pa_mpjpe_{unit}": mean(metrics.pa_mpjpe(one_sign, true) / share, factor),
-        "flipped_share": metrics.flipped_share(predicted, true),
-        "ne_visible_percent": _part_error(predicted, true, present & visible) if hidden.any() else None,
-        "ne_hidden_percent": _part_error(predicted, true, hidden) if hidden.any() else None,
+        "ne_flip_frame_percent": float(100 * signs.min(1).mean()),
+        "ne_flip_global_percent": float(100 * signs.mean(0).min()),
+        "ne_o3_percent": float(100 * found["o3"].mean()),
+        f"mpjpe_flip_frame_{unit}": float(factor * found["mpjpe"].mean()),
+        f"n_mpjpe_{unit}": float(factor * found["n_mpjpe"].mean()),
+        f"pa_mpjpe_{unit}": float(factor * found["pa_mpjpe"].mean()),
+        "flipped_share": metrics.flipped_share(signs),
+        "ne_visible_percent": float(100 * np.nanmean(found["visible"])) if some_hidden else None,
+        "ne_hidden_percent": float(100 * np.nanmean(found["hidden"])) if some_hidden else None,
+        "reprojection_median_percent": float(100 * np.median(found["reprojection"])),
     }
 
 
-def _part_error(predicted: np.ndarray, true: np.ndarray, part: np.ndarray) -> float:
-    """NE in % of some points (M,P) of shapes (M,P,3), mean over the frames that have such points."""
-    some = part.any(1)
-    predicted, true = (points[some] - points[some].mean(1, keepdims=True) for points in (predicted, true))
-    flipped = metrics.flip_depth(predicted)
-    worse = np.linalg.norm(flipped - true, axis=(1, 2)) < np.linalg.norm(predicted - true, axis=(1, 2))
-    square = ((np.where(worse[:, None, None], flipped, predicted) - true) ** 2).sum(2)
-    distance = np.where(part[some], square, 0.0).sum(1) / part[some].sum(1)
-    return float(100 * np.sqrt(distance / (true**2).sum(2).mean(1)).mean())
+def _frame_errors(compared: Comparison, prediction: Prediction, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Errors of some frames, (M,) each and (M,2) of both signs."""
+    truth = compared.truth
+    predicted, true = pair(prediction.S, truth, rows)
+    present, visible = truth.present[rows], truth.visible[rows]
+    share, flipped = present.mean(1), metrics.flip_depth(predicted)
+    one_sign = flipped if compared.mirrored else predicted
+    signs = metrics.normalised_error_of_signs(predicted, true)
+    best = np.where((signs[:, 1] < signs[:, 0])[:, None, None], flipped, predicted)
+    return {
+        "signs": signs,
+        "o3": metrics.normalised_error_o3(predicted, true),
+        "mpjpe": metrics.mpjpe_flip_frame(predicted, true) / share,
+        "n_mpjpe": metrics.n_mpjpe(one_sign, true) / share,
+        "pa_mpjpe": metrics.pa_mpjpe(one_sign, true) / share,
+        "visible": _part_error(best, true, present, visible),
+        "hidden": _part_error(best, true, present, ~visible),
+        "reprojection": _reprojection(prediction.S[rows, :2], truth.W[rows], visible),
+    }
 
 
-def _reprojection(truth: Sequence, found: Prediction, rows: np.ndarray) -> float:
-    """Median over frames of the rms distance of visible points to where they were seen, in % of their rms extent."""
-    visible = truth.visible[rows]
+def _part_error(predicted: np.ndarray, true: np.ndarray, present: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """(M,) rms distance over some points (M,P) of the centred shapes, as a share of the whole truth's rms size.
+
+    As NE, were all points as far off as these. NaN for frames that have no such points.
+    """
+    predicted, true = (points - points.mean(1, keepdims=True) for points in (predicted, true))
+    part = part & present
+    square = np.where(part, ((predicted - true) ** 2).sum(2), 0.0).sum(1)
+    size = (true**2).sum((1, 2)) / present.sum(1)
+    count = part.sum(1)
+    return np.where(count > 0, np.sqrt(square / np.maximum(count, 1) / size), np.nan)
+
+
+def _reprojection(xy: np.ndarray, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """(M,) rms distance of visible points (M,2,P) to where they were seen, as a share of their rms extent."""
     seen = visible[:, None]
-    W = np.where(seen, centred(truth.W[rows], visible), 0.0)
-    off = np.where(seen, centred(found.S[rows][:, :2], visible) - W, 0.0)
-    extent = np.maximum((W**2).sum((1, 2)), np.finfo(float).tiny)
-    return float(100 * np.median(np.sqrt((off**2).sum((1, 2)) / extent)))
+    W = np.where(seen, centred(W, visible), 0.0)
+    off = np.where(seen, centred(xy, visible) - W, 0.0)
+    return np.sqrt((off**2).sum((1, 2)) / np.maximum((W**2).sum((1, 2)), np.finfo(float).tiny))
 
 
 _LINES = (

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from paul_ros import metrics
-from training.evaluation import Comparison
+from training.evaluation import Comparison, errors_of_signs, pair
 from training.pictures import COLOURS, bare, draw_shape, new_figure, percent_axis, save_figure, titled, turned_view
 
 _SHARES = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -17,22 +17,19 @@ _SHARES = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 
 def write_picture(path: str | Path, compared: Comparison, title: str) -> None:
     """Draw and write. Raises ImportError without matplotlib, PictureError for an odd suffix."""
-    predicted, true = compared.points(compared.found), compared.points()
-    flipped = metrics.normalised_error(metrics.flip_depth(predicted), true) < metrics.normalised_error(predicted, true)
-    predicted = np.where(flipped[:, None, None], metrics.flip_depth(predicted), predicted)
-    error = 100 * metrics.normalised_error(predicted, true)
+    signs = errors_of_signs(compared.found.S, compared.truth, compared.rows)
+    rigid = errors_of_signs(compared.rigid.S, compared.truth, compared.rows).min(1)
+    error, flipped = 100 * signs.min(1), signs[:, 1] < signs[:, 0]
     order = error.argsort()
     chosen = order[[int(round(share * (len(order) - 1))) for share in _SHARES]]
+    predicted, true = pair(compared.found.S, compared.truth, compared.rows[chosen])
+    predicted = np.where(flipped[chosen, None, None], metrics.flip_depth(predicted), predicted)
     figure = new_figure(14, 8.2)
     figure.suptitle(title, fontsize=13, fontweight="bold")
     above, below = figure.subfigures(2, 1, height_ratios=[1.9, 1])
-    _draw_frames(above.subplots(2, len(chosen)), compared, predicted[chosen], true[chosen], error[chosen])
-    _draw_curve(below.subplots(), error[order], 100 * _sorted_errors(compared))
+    _draw_frames(above.subplots(2, len(chosen)), compared, predicted, true, error[chosen])
+    _draw_curve(below.subplots(), error[order], 100 * np.sort(rigid))
     save_figure(figure, path)
-
-
-def _sorted_errors(compared: Comparison) -> np.ndarray:
-    return np.sort(metrics.normalised_error_flip_frame(compared.points(compared.rigid), compared.points()))
 
 
 def _draw_frames(axes: Any, compared: Comparison, predicted: np.ndarray, true: np.ndarray, error: np.ndarray) -> None:

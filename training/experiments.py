@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from paul_ros import metrics
 from paul_ros.model import enough_visible
 from paul_ros.skeleton import LayoutError, anonymous_layout
 from training import reconstruction
 from training.data import DataError, TrainingData, load_training_data
+from training.evaluation import LEAST_VISIBLE, errors_of_signs
 from training.recipe import Recipe, RecipeError
 from training.reconstruction import Reconstruction
 from training.trainer import TrainingError
@@ -172,13 +172,12 @@ def _judged(run: Run, found: Reconstruction) -> Outcome:
     if found.shapes.shape != sequence.S.shape:
         raise DataError(f"the kept run of '{sequence.name}' has shapes {found.shapes.shape}: start over with --fresh")
     back = order.argsort()
-    known = sequence.present.sum(1) >= 2
-    present = sequence.present[known]
-    points, true = (metrics.fill_absent(S[known].transpose(0, 2, 1), present) for S in (found.shapes[back], sequence.S))
+    known = np.flatnonzero(sequence.present.sum(1) >= LEAST_VISIBLE)
+    signs = errors_of_signs(found.shapes[back], sequence, known)
     return Outcome(
         run,
-        float(100 * metrics.normalised_error_flip_frame(points, true).mean()),
-        float(100 * metrics.normalised_error_flip_global(points, true).mean()),
+        float(100 * signs.min(1).mean()),
+        float(100 * signs.mean(0).min()),
         float(found.loss),
         float(found.seconds),
         None if found.codes is None else found.codes[back],

@@ -17,9 +17,9 @@ class Sequence:
 
     Attributes:
         name: file name without suffix.
-        W: (F,2,P) float64 image points, y down; 0 where hidden.
+        W: (F,2,P) image points, float32 or float64, y down; 0 where hidden.
         visible: (F,P) bool.
-        S: (F,3,P) float64 truth in the camera frame, in units of W; NaN where the truth of a point is not known.
+        S: (F,3,P) truth in the camera frame and the unit of W, float32 or float64; NaN where it is not known.
         edges: (E,2) points to draw lines between, may be empty. For pictures only.
         metres: S is in metres.
     """
@@ -119,12 +119,17 @@ def _sequence(
         raise DataError(f"edges in '{path}' must be (E,2) indices of the {points} points")
     return Sequence(
         name=path.stem,
-        W=np.where(visible[:, None], W, 0.0).astype(float),
+        W=np.where(visible[:, None], W, 0).astype(_floating(W)),
         visible=visible,
-        S=S.astype(float),
+        S=S.astype(_floating(S), copy=False),
         edges=edges,
         metres=metres is not None and metres.size == 1 and bool(metres.all()),
     )
+
+
+def _floating(array: np.ndarray) -> type:
+    """Single precision stays what it is: dense truth fills memory."""
+    return np.float32 if array.dtype == np.float32 else np.float64
 
 
 def _within(edges: np.ndarray, points: int) -> bool:
