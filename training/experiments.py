@@ -9,6 +9,7 @@ changed setting begins anew. What is kept is the reconstruction; errors are comp
 from __future__ import annotations
 
 import hashlib
+import io
 import re
 import shutil
 import sys
@@ -20,6 +21,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from paul_ros.files import write_atomically
 from paul_ros.model import enough_visible
 from paul_ros.skeleton import LayoutError, anonymous_layout
 from training import reconstruction
@@ -155,8 +157,9 @@ def _given(run: Run, folder: Path) -> TrainingData:
     """The trainer's data: through a file that holds what the trainer may know and nothing else."""
     order, sequence = run.order(), run.sequence
     path = folder / "given.npz"
-    folder.mkdir(parents=True, exist_ok=True)
-    np.savez(path, W=sequence.W[order].astype(np.float32), visible=sequence.visible[order])
+    buffer = io.BytesIO()
+    np.savez(buffer, W=sequence.W[order].astype(np.float32), visible=sequence.visible[order])
+    write_atomically(path, buffer.getvalue())
     data = load_training_data(path, anonymous_layout(sequence.W.shape[2]))
     if data.left_out:
         raise DataError(
