@@ -238,7 +238,8 @@ methods: paul, adl (its decoder alone), adl_low_rank (and a nuclear norm), linea
 with), rigid; or the name or YAML file of a recipe of your own.
 
 Runs are kept in the work folder as they finish: the same command goes on where it was interrupted, and trains only
-what it has not yet. A run's folder depends on all that the run does.
+what it has not yet. Another setting, other data or another version of this package is another run; after a change of
+the program's own code use --fresh.
 
 examples:
   paul benchmark nrsfm --data nrsfm_short --json nrsfm.json --plot nrsfm.png

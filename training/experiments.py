@@ -2,8 +2,8 @@
 """Many training runs in a row, for benchmark and studies: resumable, and judged by a truth that no run has seen.
 
 A run is given its frames in an order of its seed's own, and only where points were seen: W and visible. Its folder
-under the work folder is named by all that it depends on, so that an interrupted series goes on where it was and a
-changed setting begins anew. What is kept is the reconstruction; errors are computed whenever it is read.
+under the work folder is named by what it depends on (data, recipe, seed, version of this package), so that an
+interrupted series goes on where it was and a changed setting begins anew. What is kept is the reconstruction; errors are computed whenever it is read.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from paul_ros import __version__
 from paul_ros.files import write_atomically
 from paul_ros.model import enough_visible
 from paul_ros.skeleton import LayoutError, anonymous_layout
@@ -73,7 +74,7 @@ class Run:
 
     def folder(self, work: Path) -> Path:
         """Where it is kept."""
-        digest = hashlib.sha256(repr(sorted(self.recipe().to_dict().items())).encode())
+        digest = hashlib.sha256(repr([__version__, *sorted(self.recipe().to_dict().items())]).encode())
         for array in (self.sequence.W.astype(np.float32), self.sequence.visible, self.order()):
             digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
         name = re.sub(r"[^\w.-]", "_", f"{self.sequence.name}_{Path(self.method).stem}_{self.seed}")
