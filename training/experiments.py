@@ -3,8 +3,8 @@
 
 A run is given its frames in an order of its seed's own, and only where points were seen: W and visible. Its folder
 under the work folder is named by what it depends on (data, recipe, seed, version of this package), so that an
-interrupted series goes on where it was and a changed setting begins anew. What is kept is the reconstruction; errors are
-computed whenever it is read.
+interrupted series goes on where it was and a changed setting begins anew. What is kept is the reconstruction; errors
+are computed whenever it is read.
 """
 
 from __future__ import annotations
