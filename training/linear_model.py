@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A linear Gaussian Procrustean shape model of 2D frames: probabilistic principal components under unknown cameras.
+
+Frame f is seen as ``W = R (V_0 + sum_k c_k V_k) + t + noise`` with codes c ~ N(0, I), isotropic noise of deviation
+sigma, an orthographic camera R of unit scale and a free translation t. Codes and translations integrate out in closed
+form; what is left, the bases V and the rotations R, is fitted by expectation maximisation and polished by L-BFGS. (The
+family of models is that of Lee et al., "Procrustean Normal Distribution for Non-Rigid Structure from Motion", 2013.)
+
+Sigma is annealed by the caller and never learned: learned, it runs away from good solutions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from paul_ros import viewing_sphere
+
+_RIDGE = 1e-9
+_REFINEMENTS = 6
+
+
+@dataclass(frozen=True)
+class Observations:
+    """2D frames as the model sees them.
+
+    Attributes:
+        W: (F,2,P) float64, each frame centred on its visible points, 0 where hidden; one scale for all frames.
+        visible: (F,P) bool.
+    """
+
+    W: Tensor
+    visible: Tensor
+
+    @classmethod
+    def of(cls, W: np.ndarray, visible: np.ndarray) -> Observations:
+        """Centre image points (F,2,P); anything where hidden."""
+        visible = torch.as_tensor(visible)
+        seen = visible[:, None]
+        W = torch.where(seen, torch.as_tensor(W).double(), 0.0)
+        centre = W.sum(2, keepdim=True) / seen.sum(2, keepdim=True)
+        return cls(torch.where(seen, W - centre, 0.0), visible)
+
+    def __len__(self) -> int:
+        return len(self.W)
+
+    def __getitem__(self, rows: np.ndarray) -> Observations:
+        return Observations(self.W[rows], self.visible[rows])
+
+    @property
+    def points(self) -> int:
+        """P."""
+        return self.W.shape[2]
+
+    @cached_property
+    def complete(self) -> bool:
+        """Nothing is hidden: then all frames share the second moments of the bases."""
+        return bool(self.visible.all())
+
+    @cached_property
+    def patterns(self) -> Tensor:
+        """(F,P) float64 visibility, or (1,P) where nothing is hidden."""
+        return (self.visible[:1] if self.complete else self.visible).double()
+
+    @cached_property
+    def count(self) -> Tensor:
+        """(F,) visible points."""
+        return self.visible.sum(1)
+
+    @cached_property
+    def products(self) -> Tensor:
+        """(F,2,2) second moments of the image points."""
+        return self.W @ self.W.transpose(1, 2)
+
+    @cached_property
+    def power(self) -> Tensor:
+        """(F,) squared norms of the frames."""
+        return self.W.square().sum((1, 2))
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the frames say of their codes.
+
+    Attributes:
+        mean, covariance: (F,K) and (F,K,K) of the codes.
+        nll: (F,) negative log likelihoods of the frames.
+    """
+
+    mean: Tensor
+    covariance: Tensor
+    nll: Tensor
+
+    @cached_property
+    def second(self) -> Tensor:
+        """(F,K+1,K+1) expected products of the codes (1, c)."""
+        c = with_one(self.mean)
+        E = c[:, :, None] * c[:, None]
+        E[:, 1:, 1:] += self.covariance
+        return E
+
+
+class Moments:
+    """Products of the bases with each other and with the frames: all that cameras and codes depend on.
+
+    Their size does not depend on the number of points, so that scoring many cameras is cheap.
+    """
+
+    def __init__(self, seen: Observations, V: Tensor) -> None:
+        self.seen, self.bases = seen, len(V)
+        flat = V.flatten(0, 1)
+        if seen.complete:
+            flat = flat - flat.mean(1, keepdim=True)
+            second = (flat @ flat.T)[None]
+        else:
+            second = seen.patterns @ (flat[:, None] * flat[None]).flatten(0, 1).T
+            middle = seen.patterns @ flat.T
+            second = second.unflatten(1, (len(flat), -1))
+            second = second - middle[:, :, None] * middle[:, None] / seen.count[:, None, None]
+        # (F or 1, 9, (K+1)^2): the products of coordinates i and j of bases k and l at [3 i + j, (K+1) k + l].
+        blocks = second.unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).permute(0, 2, 4, 1, 3)
+        self.second = blocks.reshape(len(second), 9, self.bases**2)
+        self.cross = (seen.W.flatten(0, 1) @ flat.T).unflatten(0, (-1, 2)).unflatten(2, (-1, 3))  # (F,2,K+1,3)
+
+    def posterior(self, R: Tensor, sigma: float) -> Posterior:
+        """Codes and likelihoods of frames seen by cameras R (F,3,3)."""
+        H, h, rest = self._system(R, sigma)
+        inverse, log_det = _inverse(H)
+        mean = (inverse @ h[..., None])[..., 0]
+        return Posterior(mean, sigma**2 * inverse, self._nll(log_det, rest - (h * mean).sum(1), sigma))
+
+    def marginal_nll(self, R: Tensor, sigma: float) -> Tensor:
+        """Negative log likelihoods (F,) with the cameras integrated out about R; for autograd.
+
+        At the best camera alone the likelihood favours models that bend a body where it turns. Integrating over small
+        turns (Laplace's method) adds half the log determinant of J, how sharply the frame tells the turn.
+
+        Gradients of factorisations are slow, and none are needed: a quadratic form at its optimum has the gradient of
+        the form with the optimum held, and one Newton step there carries the gradient of the optimum itself.
+        """
+        H, h, rest = self._system(R, sigma)
+        with torch.no_grad():
+            inverse, log_det = _inverse(H)
+            held = inverse @ h[..., None]
+        log_det = log_det + (inverse * (H - H.detach())).sum((1, 2))
+        code = (held + inverse @ (h[..., None] - H @ held))[..., 0]
+        misfit = rest - (held * (2 * h[..., None] - H @ held)).sum((1, 2))
+        own, others = self._turning(R, code)
+        Y = inverse @ others.detach()
+        J = own - 2 * Y.transpose(1, 2) @ others + Y.transpose(1, 2) @ H @ Y
+        J = (J + J.transpose(1, 2)) / (2 * sigma**2) + _RIDGE * torch.eye(3, dtype=J.dtype)
+        return self._nll(log_det, misfit, sigma) + 0.5 * torch.logdet(J)
+
+    def scores(self, R: Tensor, sigma: float) -> Tensor:
+        """Negative log likelihoods (N,F) of every frame under every one of the cameras R (N,3,3)."""
+        if not self.seen.complete:
+            return torch.stack([self.posterior(one.expand(len(self.seen), 3, 3), sigma).nll for one in R])
+        G = self._contracted(R)
+        along = torch.einsum("nai,faki->nfk", R[:, :2], self.cross)
+        H = G[:, 1:, 1:] + sigma**2 * torch.eye(self.bases - 1, dtype=G.dtype)
+        inverse, log_det = _inverse(H)
+        h = along[:, :, 1:] - G[:, None, 0, 1:]
+        rest = self.seen.power - 2 * along[:, :, 0] + G[:, :1, 0]
+        return self._nll(log_det[:, None], rest - (h * (h @ inverse)).sum(2), sigma)
+
+    def best_rotations(self, posterior: Posterior) -> Tensor:
+        """Cameras (F,3,3) of the highest expected likelihood: exact orthographic-N-point on expected moments."""
+        frames = len(self.seen)
+        A = (self.second @ posterior.second.reshape(frames, -1, 1)).view(-1, 3, 3)
+        B = torch.einsum("fk,faki->fai", with_one(posterior.mean), self.cross)
+        upper = torch.cat([(A + A.transpose(1, 2)) / 2, B.transpose(1, 2)], 2)
+        moments = torch.cat([upper, torch.cat([B, self.seen.products], 2)], 1).numpy()
+        poses = viewing_sphere.solve(moments, np.zeros((frames, 5)), "unit", rivals=False)
+        return torch.from_numpy(poses.R[:, 0])
+
+    def _contracted(self, R: Tensor) -> Tensor:
+        """Products (N,K+1,K+1) of the bases as seen by cameras (N,3,3)."""
+        Q = (R[:, :2].transpose(1, 2) @ R[:, :2]).flatten(1)
+        G = Q @ self.second[0] if len(self.second) == 1 else (Q[:, None] @ self.second)[:, 0]
+        return G.unflatten(1, (self.bases, self.bases))
+
+    def _system(self, R: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the codes: matrix H (F,K,K), right side h (F,K); and the squared norm (F,) of what the mean leaves."""
+        G, along = self._contracted(R), torch.einsum("fai,faki->fk", R[:, :2], self.cross)
+        H = G[:, 1:, 1:] + sigma**2 * torch.eye(self.bases - 1, dtype=G.dtype)
+        return H, along[:, 1:] - G[:, 0, 1:], self.seen.power - 2 * along[:, 0] + G[:, 0, 0]
+
+    def _nll(self, log_det: Tensor, misfit: Tensor, sigma: float) -> Tensor:
+        freedom = 2 * self.seen.count - 2 - (self.bases - 1)
+        return 0.5 * (freedom * math.log(sigma**2) + log_det + misfit / sigma**2)
+
+    def _turning(self, R: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
+        """Products of the three ways T (2P each) in which the image moves when the camera turns about its axes.
+
+        T_x = (0, -z), T_y = (z, 0), T_z = (-y, x): among each other (F,3,3), and with the bases (F,K,3).
+        """
+        c = with_one(code)
+        frames = len(c)
+        blocks = self.second.unflatten(2, (self.bases, self.bases))
+        mixed = (
+            torch.einsum("qkl,fl->fkq", blocks[0], c) if len(blocks) == 1 else torch.einsum("fqkl,fl->fkq", blocks, c)
+        )
+        D = R[:, None] @ mixed.view(frames, -1, 3, 3) @ R[:, None].transpose(2, 3)  # base k against the shape
+        C = (c[:, :, None, None] * D).sum(1)
+        zero = torch.zeros(frames, dtype=C.dtype)
+        xx, yy, zz, xz, yz = C[:, 0, 0], C[:, 1, 1], C[:, 2, 2], C[:, 0, 2], C[:, 1, 2]
+        own = torch.stack([zz, zero, -xz, zero, zz, -yz, -xz, -yz, xx + yy], 1).view(-1, 3, 3)
+        others = torch.stack([-D[..., 1, 2], D[..., 0, 2], D[..., 1, 0] - D[..., 0, 1]], 2)
+        return own, others[:, 1:]
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """Bases and cameras.
+
+    Attributes:
+        V: (K+1,3,P) float64 mean shape and bases, canonical frame, units of W.
+        R: (F,3,3) float64 cameras of the frames it was fitted to, det +1.
+    """
+
+    V: Tensor
+    R: Tensor
+
+    @classmethod
+    def random(cls, frames: int, points: int, bases: int, generator: np.random.Generator) -> LinearModel:
+        """A random non-rigid shape under random cameras: from there every basin can be reached."""
+        V = generator.standard_normal((bases + 1, 3, points))
+        V[1:] *= 0.3
+        return cls(_centred(torch.from_numpy(V)), random_rotations(frames, generator))
+
+    def widened(self, bases: int, generator: np.random.Generator) -> LinearModel:
+        """With new, small random bases up to the number K."""
+        extra = 0.02 * generator.standard_normal((bases + 1 - len(self.V), *self.V.shape[1:]))
+        return replace(self, V=torch.cat([self.V, _centred(torch.from_numpy(extra))]))
+
+    def posterior(self, seen: Observations, sigma: float) -> Posterior:
+        """Codes and likelihoods of the frames."""
+        return Moments(seen, self.V).posterior(self.R, sigma)
+
+    def shapes(self, posterior: Posterior) -> Tensor:
+        """Expected shapes (F,3,P), canonical frame."""
+        return torch.tensordot(with_one(posterior.mean), self.V, 1)
+
+    def em_step(self, seen: Observations, sigma: float, penalty: float) -> LinearModel:
+        """One step of expectation maximisation: bases, cameras, and codes made white again."""
+        posterior = self.posterior(seen, sigma)
+        model = replace(self, V=_best_bases(self, seen, posterior, sigma, penalty))
+        moments = Moments(seen, model.V)
+        model = replace(model, R=moments.best_rotations(moments.posterior(model.R, sigma)))
+        return replace(model, V=_whitened(model.V, moments.posterior(model.R, sigma)))
+
+    def searched(
+        self, seen: Observations, sigma: float, generator: np.random.Generator, count: int = 200, best: int = 3
+    ) -> LinearModel:
+        """With every camera searched for globally: random rotations scored by likelihood, the best few refined."""
+        moments = Moments(seen, self.V)
+        candidates = random_rotations(count, generator)
+        chosen = moments.scores(candidates, sigma).topk(best, dim=0, largest=False).indices
+        R, nll = self.R, moments.posterior(self.R, sigma).nll
+        for other in candidates[chosen]:
+            for _ in range(_REFINEMENTS):
+                other = moments.best_rotations(moments.posterior(other, sigma))
+            other_nll = moments.posterior(other, sigma).nll
+            R = torch.where((other_nll < nll)[:, None, None], other, R)
+            nll = torch.minimum(nll, other_nll)
+        return replace(self, R=R)
+
+    def polished(self, seen: Observations, sigma: float, penalty: float, iterations: int) -> LinearModel:
+        """With bases and cameras descended together by L-BFGS, which gets along the valleys that EM crawls in."""
+        V = self.V.clone().requires_grad_()
+        turn = torch.zeros(len(self.R), 3, dtype=torch.float64, requires_grad=True)
+        optimizer = torch.optim.LBFGS(
+            [V, turn],
+            max_iter=iterations,
+            history_size=20,
+            line_search_fn="strong_wolfe",
+            tolerance_grad=1e-9,
+            tolerance_change=1e-12,
+        )
+
+        def evaluate() -> Tensor:
+            optimizer.zero_grad()
+            nll = Moments(seen, V).marginal_nll(rotations_of(turn) @ self.R, sigma)
+            loss = nll.mean() + penalty * V.square().sum() / (3 * seen.points)
+            loss.backward()
+            return loss
+
+        optimizer.step(evaluate)
+        return LinearModel(_centred(V.detach()), rotations_of(turn.detach()) @ self.R)
+
+    def objective(self, seen: Observations, sigma: float, penalty: float) -> float:
+        """Mean negative log likelihood of a frame, plus the penalty on the size of the bases."""
+        nll = Moments(seen, self.V).marginal_nll(self.R, sigma).mean()
+        return float(nll + penalty * self.V.square().sum() / (3 * seen.points))
+
+
+def random_rotations(count: int, generator: np.random.Generator) -> Tensor:
+    """(N,3,3) rotations, uniform: unit quaternions of four normal numbers (Shoemake 1992)."""
+    q = torch.from_numpy(generator.standard_normal((4, count)))
+    w, x, y, z = q / q.norm(dim=0)
+    rows = (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack(rows, 1).view(-1, 3, 3)
+
+
+def rotations_of(turn: Tensor) -> Tensor:
+    """Rotations (N,3,3) by rotation vectors (N,3) (Rodrigues), smooth at 0."""
+    x, y, z = turn.unbind(1)
+    zero = torch.zeros_like(x)
+    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).view(-1, 3, 3)
+    angle = turn.square().sum(1).add(1e-24).sqrt()[:, None, None]
+    one = torch.eye(3, dtype=turn.dtype)
+    return one + torch.sin(angle) / angle * K + (1 - torch.cos(angle)) / angle**2 * (K @ K)
+
+
+def with_one(code: Tensor) -> Tensor:
+    """(F,K+1) codes (1, c) of codes (F,K)."""
+    return torch.cat([torch.ones_like(code[:, :1]) if code.shape[1] else code.new_ones(len(code), 1), code], 1)
+
+
+def _inverse(H: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses and log determinants of positive definite matrices (N,K,K)."""
+    L = torch.linalg.cholesky(H)
+    return torch.cholesky_inverse(L), 2 * L.diagonal(dim1=1, dim2=2).log().sum(1)
+
+
+def _centred(V: Tensor) -> Tensor:
+    return V - V.mean(2, keepdim=True)
+
+
+def _best_bases(model: LinearModel, seen: Observations, posterior: Posterior, sigma: float, penalty: float) -> Tensor:
+    """The bases (K+1,3,P) of the highest expected likelihood minus penalty, one linear system a point.
+
+    The translation of a frame with hidden points moves with its code: t = -R (mean of the visible points of V) (1, c).
+    """
+    bases, _, points = model.V.shape
+    size, R, E = 3 * bases, model.R[:, :2], posterior.second
+    Q = R.transpose(1, 2) @ R
+    per_frame = (E[:, :, None, :, None] * Q[:, None, :, None, :]).reshape(len(seen), size * size)
+    right = torch.einsum("fk,fip->kip", with_one(posterior.mean), R.transpose(1, 2) @ seen.W).reshape(size, points)
+    ridge = (2 * penalty / (3 * points) * sigma**2 * len(seen) + _RIDGE) * torch.eye(size, dtype=right.dtype)
+    if seen.complete:
+        left = per_frame.sum(0).view(size, size) + ridge
+        return _centred(torch.linalg.solve(left, right).view(bases, 3, points))
+    visible = seen.visible.double()
+    middle = torch.einsum("fp,kip->fki", visible / seen.count[:, None], model.V)
+    pull = (E @ middle @ Q).reshape(-1, size)
+    right = right + pull.T @ visible
+    left = (visible.T @ per_frame).view(points, size, size) + ridge
+    return _centred(torch.linalg.solve(left, right.T[..., None])[..., 0].T.reshape(bases, 3, points))
+
+
+def _whitened(V: Tensor, posterior: Posterior) -> Tensor:
+    """Bases (K+1,3,P) under which the codes have mean 0 and covariance I."""
+    mean = posterior.mean.mean(0)
+    covariance = posterior.second[:, 1:, 1:].mean(0) - torch.outer(mean, mean)
+    root = torch.linalg.cholesky(covariance + _RIDGE * torch.eye(len(mean), dtype=mean.dtype))
+    return torch.cat([V[:1] + torch.tensordot(mean, V[1:], 1), torch.tensordot(root.T, V[1:], 1)])
