@@ -359,10 +359,9 @@ class Trainer:
 
     def _identity(self) -> dict[str, str]:
         """What a checkpoint belongs to."""
-        recipe = {key: value for key, value in self.recipe.to_dict().items() if key != "restarts"}
         return {
             "data": self.data.sha256,
-            "recipe": repr(sorted(recipe.items())),
+            "recipe": repr(sorted(self.recipe.to_dict().items())),
             "layout": repr(sorted(self.data.layout.to_dict().items(), key=lambda item: item[0])),
         }
 
