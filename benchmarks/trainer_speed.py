@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from paul_ros.files import write_atomically
 from paul_ros.model import load_model
@@ -70,10 +71,10 @@ class Twin:
 
     def loss(self, rows: Tensor) -> Tensor:
         """The paper's equation 7 of some frames (N,)."""
-        W, visible = self.W[rows], self.visible[rows]
-        code = self.networks.codes(W, visible, rows)
-        ad = self.networks.decoder(code)
-        ae = self.networks.decoder(self.networks.shape_encoder(ad))
+        W = self.W[rows]
+        code = self.code(rows)
+        ad = self.decode(code)
+        ae = self.decode(self.layers(self.networks.shape_encoder, ad.flatten(1)))
         R = self.camera(ad, ae, W)
         z = (R[:, 2:] @ (ad + ae)) / 2
         target = R.transpose(1, 2) @ torch.cat([W, z], dim=1)
@@ -82,6 +83,29 @@ class Twin:
         for weight in self.networks.decoder.parameters():
             loss = loss + self.recipe.decay_weight * weight.square().sum()
         return loss
+
+    def code(self, rows: Tensor) -> Tensor:
+        """Codes (N,K), free or by the residual encoder."""
+        if self.recipe.codes == "free":
+            return self.networks.free_codes(rows)
+        encoder = self.networks.encoder
+        x = F.relu(encoder.input(torch.cat([self.W[rows].flatten(1), self.visible[rows].float()], dim=1)))
+        for block in encoder.blocks:
+            x = x + F.relu(block.second(F.relu(block.first(x))))
+        return encoder.output(x)
+
+    def decode(self, code: Tensor) -> Tensor:
+        """Shapes (N,3,P), centred."""
+        S = self.layers(self.networks.decoder, code).unflatten(1, (3, -1))
+        return S - S.mean(2, keepdim=True)
+
+    @staticmethod
+    def layers(layers: nn.ModuleList, x: Tensor) -> Tensor:
+        """Linear layers with ELU between them."""
+        *inner, last = layers
+        for layer in inner:
+            x = F.elu(layer(x))
+        return last(x)
 
     @staticmethod
     def camera(ad: Tensor, ae: Tensor, W: Tensor) -> Tensor:

@@ -437,8 +437,11 @@ def _start(xp: Kind, problem: Problem) -> Vector:
 
 def _solve(xp: Kind, problem: Problem, scale: Scale) -> Solution:
     """The better of the optima near the start and near the reversal of the first; the other is its rival."""
-    n = _start(xp, problem)
-    one = xp.climb(problem, n, scale)
+    return _solve_from(xp, problem, xp.climb(problem, _start(xp, problem), scale), scale)
+
+
+def _solve_from(xp: Kind, problem: Problem, one: View, scale: Scale) -> Solution:
+    """The same with the first climb done."""
     two = xp.climb(problem, _reversal(one.n), scale, one.n)
     swap = (two.g > one.g) & _apart(two.n, one.n)
     found = _with_rival(xp, problem, xp.where(swap, two, one), xp.where(swap, one, two), scale)
@@ -453,7 +456,7 @@ def _solve_alone(xp: Kind, problem: Problem, scale: Scale) -> Solution:
 
 
 def _solve_again(xp: Kind, problem: Problem, found: Solution, scale: Scale) -> Solution:
-    whole = _solve(xp, problem, scale)
+    whole = _solve_from(xp, problem, found.best, scale)
     return whole._replace(rival=whole.best)
 
 

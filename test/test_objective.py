@@ -139,9 +139,10 @@ def test_the_auto_decoder_has_one_stream():
     recipe = replace(PAPER, streams="decoder")
     networks, layout, views = case(0.0, recipe)
     found, terms = fit(networks, recipe, views, ROWS), paul_terms(networks, layout, recipe, views, ROWS)
-    assert found.ae is None and terms.recon_ae == 0
-    torch.testing.assert_close(found.points[:, 2], found.ad[:, 2])  # depth is its own
-    torch.testing.assert_close(terms.recon_ad, (found.ad - found.points)[:, :2].norm(dim=(1, 2)).mean())
+    (ad,) = found.streams
+    assert terms.recon_ae == 0
+    torch.testing.assert_close(found.points[:, 2], ad[:, 2])  # depth is its own
+    torch.testing.assert_close(terms.recon_ad, (ad - found.points)[:, :2].norm(dim=(1, 2)).mean())
 
 
 def test_the_nuclear_norm_is_that_of_the_batch_of_shapes():
@@ -161,7 +162,7 @@ def test_the_default_weights_are_the_earlier_ones_times_the_root_of_17():
     W = torch.from_numpy(100 * load_model().mean_shape[None, :2] + np.random.default_rng(0).normal(0, 9, (8, 2, 17)))
     views = batch(W.float(), torch.ones(8, 17, dtype=torch.bool))
     terms, found = paul_terms(networks, COCO, recipe, views, ROWS), fit(networks, recipe, views, ROWS)
-    per_point = [(S - found.points).square().sum((1, 2)).div(17).sqrt().mean() for S in (found.ae, found.ad)]
+    per_point = [(S - found.points).square().sum((1, 2)).div(17).sqrt().mean() for S in found.streams]
     earlier = (
         sum(per_point)
         + 1e-3 * found.code.square().sum(1).mean()

@@ -18,6 +18,46 @@ _FREE_CODE_SIZE = 0.1
 """Standard deviation of free codes at the start: a tenth or ten times of it trained worse."""
 
 
+_AXIS_VIEWS = 1000
+"""Views that the main axis is found from."""
+
+
+class _Layers(torch.autograd.Function):
+    """Linear layers with an ELU between any two: x (N,inputs) and each layer's weight and bias to (N,outputs).
+
+    One function of autograd's, for batches so small that its bookkeeping would cost as much as the layers; and with an
+    ELU made of exp, which is several times faster than expm1 and as good: the slope is taken from the result.
+    """
+
+    @staticmethod
+    def forward(ctx: torch.autograd.function.FunctionCtx, x: Tensor, *parameters: Tensor) -> Tensor:
+        weights, biases = parameters[::2], parameters[1::2]
+        inputs = [x]
+        for weight, bias in zip(weights[:-1], biases[:-1]):
+            y = torch.addmm(bias, inputs[-1], weight.T)
+            below = y.clamp_max(0).exp_().sub_(1)
+            inputs.append(torch.maximum(y, below, out=below))
+        ctx.save_for_backward(*inputs, *weights)
+        return torch.addmm(biases[-1], inputs[-1], weights[-1].T)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tuple[Tensor, ...]:
+        count = len(ctx.saved_tensors) // 2
+        inputs, weights = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
+        found = []
+        for layer in reversed(range(count)):
+            found += [gradient.sum(0), gradient.T @ inputs[layer]]
+            gradient = gradient @ weights[layer]
+            if layer:
+                gradient = torch.ops.aten.elu_backward(gradient, 1, 1, 1, True, inputs[layer])
+        return gradient, *reversed(found)
+
+
+def _through(layers: nn.ModuleList, x: Tensor) -> Tensor:
+    return _Layers.apply(x, *(parameter for layer in layers for parameter in (layer.weight, layer.bias)))
+
+
 class ResidualBlock(nn.Module):
     """Two linear layers with a skip (Martinez et al., ICCV 2017), without batch normalisation or dropout."""
 
@@ -26,29 +66,49 @@ class ResidualBlock(nn.Module):
         self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + F.relu(self.second(F.relu(self.first(x))))
+        return x + self.second(self.first(x).relu_()).relu_()
 
 
-class ResidualEncoder(nn.Module):
+class Encoder(nn.Module):
+    """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K).
+
+    Args:
+        axis: (P,) weights of the points whose weighted sum every view is turned by, to point up; None: views as they
+            are. An orthographic camera that rolls sees the same shape, which so need not be learned for every roll.
+    """
+
+    def __init__(self, axis: Tensor | None) -> None:
+        super().__init__()
+        self.register_buffer("axis", axis)
+
+    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
+        return self.code(W if self.axis is None else upright(W, self.axis), visible)
+
+    def code(self, W: Tensor, visible: Tensor) -> Tensor:
+        """h of views that are turned already."""
+        raise NotImplementedError
+
+
+class ResidualEncoder(Encoder):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by residual blocks.
 
     Martinez et al. have 2 blocks; 6 of width 1024 are the depth of C3DPO (Novotny et al., ICCV 2019).
     """
 
-    def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
-        super().__init__()
+    def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axis: Tensor | None = None) -> None:
+        super().__init__(axis)
         self.input = nn.Linear(3 * points, width)
         self.blocks = nn.ModuleList(ResidualBlock(width) for _ in range(blocks))
         self.output = nn.Linear(width, bottleneck)
 
-    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
-        x = F.relu(self.input(torch.cat([W.flatten(1), visible.to(W.dtype)], dim=1)))
+    def code(self, W: Tensor, visible: Tensor) -> Tensor:
+        x = self.input(torch.cat([W.flatten(1), visible.to(W.dtype)], dim=1)).relu_()
         for block in self.blocks:
             x = block(x)
         return self.output(x)
 
 
-class ConvolutionalEncoder(nn.Module):
+class ConvolutionalEncoder(Encoder):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by block-sparse coding.
 
     The encoder of Deep NRSfM (Kong and Lucey, ICCV 2019).  An orthographic view of S = sum_k c_k D_k by a camera R is
@@ -65,8 +125,8 @@ class ConvolutionalEncoder(nn.Module):
     is solved for), and the last layer is also told which points are visible.
     """
 
-    def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
-        super().__init__()
+    def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axis: Tensor | None = None) -> None:
+        super().__init__(axis)
         atoms = dictionary_sizes(width, blocks, bottleneck)
         sizes = [(3 * atoms[0], points), *zip(atoms[1:], atoms)]
         self.dictionaries = nn.ParameterList(torch.empty(size) for size in sizes)
@@ -75,7 +135,7 @@ class ConvolutionalEncoder(nn.Module):
             nn.init.kaiming_normal_(dictionary)
         self.output = nn.Linear(6 * atoms[-1] + points, bottleneck)
 
-    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
+    def code(self, W: Tensor, visible: Tensor) -> Tensor:
         first, *others = self.dictionaries
         x = (W @ first.T).reshape(len(W), 6, -1)
         x = F.relu(x - self.thresholds[0])
@@ -99,10 +159,7 @@ class ShapeDecoder(nn.ModuleList):
         self.layout, self.unit_size = layout, unit_size
 
     def forward(self, code: Tensor) -> Tensor:
-        *inner, last = self
-        for layer in inner:
-            code = F.elu(layer(code))
-        S = last(code).unflatten(1, (3, -1))
+        S = _through(self, code).unflatten(1, (3, -1))
         return to_unit_size(S, self.layout) if self.unit_size else to_centre(S, self.layout)
 
 
@@ -114,11 +171,7 @@ class ShapeEncoder(nn.ModuleList):
         super().__init__(nn.Linear(inputs, outputs) for inputs, outputs in zip(sizes, sizes[1:]))
 
     def forward(self, S: Tensor) -> Tensor:
-        x = S.flatten(1)
-        *inner, last = self
-        for layer in inner:
-            x = F.elu(layer(x))
-        return last(x)
+        return _through(self, S.flatten(1))
 
 
 class Paul(nn.Module):
@@ -147,14 +200,15 @@ class Paul(nn.Module):
         return self.encoder(W, visible) if self.free_codes is None else self.free_codes(rows)
 
 
-def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
+def build_networks(layout: Layout, recipe: Recipe, frames: int, axis: Tensor | None = None) -> Paul:
     """The recipe's networks for a layout, with fresh weights from torch's default generator.
 
     Args:
         frames: number of training frames, for free codes.
+        axis: (P,) of ``Encoder``.
     """
     points, K = len(layout.names), recipe.bottleneck
-    encoder = ENCODERS[recipe.encoder](points, K, recipe.width, recipe.blocks)
+    encoder = ENCODERS[recipe.encoder](points, K, recipe.width, recipe.blocks, axis)
     decoder = ShapeDecoder(layout, K, recipe.hidden, unit_size=recipe.scale == "free")
     shape_encoder = ShapeEncoder(points, K, recipe.hidden)
     free_codes = None
@@ -162,6 +216,19 @@ def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
         free_codes = nn.Embedding(frames, K)
         nn.init.normal_(free_codes.weight, std=_FREE_CODE_SIZE)
     return Paul(encoder, decoder, shape_encoder, free_codes)
+
+
+def main_axis(W: Tensor) -> Tensor:
+    """(P,) unit weights of the points whose sum over views (F,2,P) is longest: the first principal direction."""
+    some = W[torch.linspace(0, len(W) - 1, min(len(W), _AXIS_VIEWS)).long()]
+    return torch.linalg.svd(some.flatten(0, 1).double(), full_matrices=False).Vh[0].to(W)
+
+
+def upright(W: Tensor, axis: Tensor) -> Tensor:
+    """Views (N,2,P) turned so that the sum of their points, weighted by ``axis`` (P,), points along the second axis."""
+    x, y = torch.nn.functional.normalize(W @ axis, dim=1).unbind(1)
+    turn = torch.stack([torch.stack([y, -x], 1), torch.stack([x, y], 1)], 1)
+    return turn @ W
 
 
 def to_centre(S: Tensor, layout: Layout) -> Tensor:

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from paul_ros.skeleton import Layout
 from training.distributed import WHOLE, Share
@@ -102,16 +103,15 @@ class Fit:
         code: (N,K) phi.
         shape: (N,3,P) f_d(phi), canonical frame.
         camera: R and scale.
-        ae, ad: (N,3,P) both streams in the camera frame, in units of W, centred on the visible points; ae is None where
-            the decoder's stream is trained alone.
+        streams: (2,N,3,P) f_d f_e f_d(phi) and f_d(phi) in the camera frame, in units of W, centred on the visible
+            points; (1,N,3,P) where the decoder's stream is trained alone.
         points: (N,3,P) S_cam of equations 4 and 14: observed where it is, else the mean of the streams.
     """
 
     code: Tensor
     shape: Tensor
     camera: Camera
-    ae: Tensor | None
-    ad: Tensor
+    streams: Tensor
     points: Tensor
 
 
@@ -119,26 +119,33 @@ def fit(networks: Paul, recipe: Recipe, views: Views, rows: Tensor) -> Fit:
     """Decode a batch and solve its cameras (equations 8-10); rows (N,) are the frames' numbers, for free codes."""
     W, visible = views.W, views.visible
     code = networks.codes(W, visible, rows)
-    ad = networks.decoder(code)
-    streams = [ad] if recipe.streams == "decoder" else [networks.decoder(networks.shape_encoder(ad)), ad]
+    shape, streams = _decoded(networks, recipe, code)
     camera = _camera(streams, W, visible, recipe)
     if views.calibrated:
-        mean = centre(sum(streams) / len(streams), visible)
+        mean = centre(streams.mean(0), visible)
         W = undo_perspective(views, camera.scale * camera.R[:, 2:] @ mean)
         camera = _camera(streams, W, visible, recipe)
-    seen_streams = [camera.scale * camera.R @ centre(S, visible) for S in streams]
-    free = sum(seen_streams) / len(streams)  # z*, and the whole of every hidden point
+    streams = camera.scale * camera.R @ centre(streams, visible)
+    free = streams.mean(0)  # z*, and the whole of every hidden point
     known = visible[:, None] & torch.tensor([True, True, False], device=W.device)[:, None]
     points = torch.where(known, torch.cat([W, W[:, :1]], dim=1), free)
-    return Fit(code, ad, camera, seen_streams[0] if len(streams) == 2 else None, seen_streams[-1], points)
+    return Fit(code, shape, camera, streams, points)
 
 
-def _camera(streams: list[Tensor], W: Tensor, visible: Tensor, recipe: Recipe) -> Camera:
+def _decoded(networks: Paul, recipe: Recipe, code: Tensor) -> tuple[Tensor, Tensor]:
+    """f_d(phi) of codes (N,K), and the streams that the recipe trains (2,N,3,P) or (1,N,3,P), the former last."""
+    shape = networks.decoder(code)
+    if recipe.streams == "decoder":
+        return shape, shape[None]
+    return shape, torch.stack([networks.decoder(networks.shape_encoder(shape)), shape])
+
+
+def _camera(streams: Tensor, W: Tensor, visible: Tensor, recipe: Recipe) -> Camera:
     """The lower level's cameras.  Exactly: OnP of the streams' mean; algebraically: least squares of them all (9)."""
     if recipe.solver == "exact":
-        return solve_camera(sum(streams) / len(streams), W, visible, recipe.scale)
-    shapes = torch.cat([centre(S, visible) for S in streams], dim=2)
+        return solve_camera(streams.mean(0), W, visible, recipe.scale)
     times = len(streams)
+    shapes = torch.cat([*centre(streams, visible)], dim=2)
     return algebraic_camera(shapes, W.repeat(1, 1, times), visible.repeat(1, times), recipe.scale)
 
 
@@ -147,9 +154,8 @@ def paul_terms(
 ) -> Terms:
     """Evaluate the objective on a batch, or on this process's share of it: terms are always those of the batch."""
     found = fit(networks, recipe, views, rows)
-    own = own_points(views.visible, layout)
-    ae = None if found.ae is None else _distance(found.ae, found.points, own)
-    return _terms(networks, layout, recipe, found.code, found.shape, ae, _distance(found.ad, found.points, own), share)
+    distances = _distances(found.streams, found.points, own_points(views.visible, layout))
+    return _terms(networks, layout, recipe, found.code, found.shape, distances, share)
 
 
 def regression_terms(
@@ -157,12 +163,9 @@ def regression_terms(
 ) -> Terms:
     """The same objective with known canonical shapes S (N,3,P) in place of R^T [W; z]: equation 3, supervised."""
     code = networks.codes(views.W, views.visible, rows)
-    shape = networks.decoder(code)
-    own = own_points(views.visible, layout)
-    ae = None
-    if recipe.streams == "both":
-        ae = _distance(networks.decoder(networks.shape_encoder(shape)), S, own)
-    return _terms(networks, layout, recipe, code, shape, ae, _distance(shape, S, own), share)
+    shape, streams = _decoded(networks, recipe, code)
+    distances = _distances(streams, S, own_points(views.visible, layout))
+    return _terms(networks, layout, recipe, code, shape, distances, share)
 
 
 def _terms(
@@ -171,14 +174,13 @@ def _terms(
     recipe: Recipe,
     code: Tensor,
     shape: Tensor,
-    ae: Tensor | None,
-    ad: Tensor,
+    distances: Tensor,
     share: Share,
 ) -> Terms:
-    """Weigh the distances (N,) of both streams and the regularisers of codes (N,K) and shapes (N,3,P)."""
-    ae = torch.zeros_like(ad) if ae is None else ae
-    recon_ae, recon_ad, size = share.whole(torch.stack([ae, ad, code.square().sum(1)], dim=1)).mean(0)
-    handedness = bones = nuclear = shape.new_zeros(())
+    """Weigh the distances of the streams (2,N) or (1,N), and the regularisers of codes (N,K) and shapes (N,3,P)."""
+    handedness = bones = nuclear = none = shape.new_zeros(())
+    *recon, size = share.whole(torch.cat([distances, code.square().sum(1)[None]]).T).mean(0).unbind()
+    recon_ae, recon_ad = recon if len(recon) == 2 else (none, *recon)
     if recipe.handedness_weight or recipe.bone_weight or recipe.nuclear_weight:
         shape = share.whole(shape)
     if recipe.handedness_weight:
@@ -187,12 +189,12 @@ def _terms(
         bones = bone_variation(shape, layout)
     if recipe.nuclear_weight:
         nuclear = torch.linalg.matrix_norm(shape.flatten(1), "nuc")
-    decay = sum(weight.square().sum() for weight in networks.decoder.parameters())
+    theta = parameters_to_vector(networks.decoder.parameters())
     loss = (
         recon_ae
         + recon_ad
         + recipe.code_weight * size
-        + recipe.decay_weight * decay
+        + recipe.decay_weight * theta.dot(theta)
         + recipe.nuclear_weight * nuclear
         # Frobenius norms grow with the square root of the number of points; these two do not.
         + shape.shape[2] ** 0.5 * (recipe.handedness_weight * handedness + recipe.bone_weight * bones)
@@ -225,10 +227,11 @@ def own_points(visible: Tensor, layout: Layout) -> Tensor | None:
     return member[(visible.float() @ member.T).argmax(1)]
 
 
-def _distance(X: Tensor, target: Tensor, own: Tensor | None) -> Tensor:
-    """Frobenius distances (N,) of own points, unsquared; the small constant keeps the gradient finite at distance 0."""
-    difference = X - target if own is None else (X - target) * own[:, None]
-    return difference.square().sum((1, 2)).add(1e-8 * X.shape[2]).sqrt()
+def _distances(streams: Tensor, target: Tensor, own: Tensor | None) -> Tensor:
+    """Frobenius distances (2,N) of streams (2,N,3,P) from target (N,3,P), unsquared, of own points (N,P) alone."""
+    difference = streams - target if own is None else (streams - target) * own[:, None]
+    # The small constant keeps the gradient finite at distance 0.
+    return difference.square().sum((2, 3)).add(1e-8 * target.shape[2]).sqrt()
 
 
 def handedness_violation(S: Tensor, layout: Layout, margin: float = 0.5) -> Tensor:

@@ -6,9 +6,8 @@ Three ways, for different losses:
 - ``solve_streams`` is the paper's lower-level problem itself, its two reconstruction streams, unknown depth and unit
   scale.  Solved exactly, its solution needs no gradient of its own where the training loss is the same squared cost:
   at an optimum the cost does not change with the pose (envelope theorem).
-- ``solve_camera`` is the exact optimum as a differentiable function, for every other loss: one Newton step is recorded
-  at the optimum, whose derivative is that of the optimum itself (implicit function theorem). ``objective.py`` trains
-  with it, for its losses are unsquared and more than one.
+- ``solve_camera`` is the exact optimum as a differentiable function, for every other loss, by the implicit function
+  theorem. ``objective.py`` trains with it, for its losses are unsquared and more than one.
 - ``algebraic_camera`` is the paper's own approximation, least squares projected onto the rotations (section 4.2).
 
 Exact means the global optimum of ``paul_ros.onp``, which solves on the CPU; only second moments, 25 numbers a shape,
@@ -28,6 +27,8 @@ from paul_ros import viewing_sphere
 Scale = viewing_sphere.Scale
 
 _RIDGE = 1e-4  # of the shape's squared size: keeps flat shapes solvable
+_FLAT = 1e-9  # of the squared size's square: an optimum on a flatter hill is moved as if it were as steep
+_TINY = 1e-30
 
 
 class Camera(NamedTuple):
@@ -38,12 +39,12 @@ class Camera(NamedTuple):
 
 
 def centre(X: Tensor, visible: Tensor) -> Tensor:
-    """Points (N,D,P) minus the mean of the visible ones (N,P): the adaptive normalisation of section 4.3.
+    """Points (...,N,D,P) minus the mean of the visible ones (N,P): the adaptive normalisation of section 4.3.
 
     The printed line lacks the factor 1/v (v visible points) that its derivation gives; this is the derived form.
     """
     seen = visible[:, None].to(X.dtype)
-    return X - (X * seen).sum(2, keepdim=True) / seen.sum(2, keepdim=True)
+    return X - X @ (seen / seen.sum(2, keepdim=True)).transpose(1, 2)
 
 
 def solve_streams(
@@ -93,13 +94,7 @@ def optimal_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free")
         The camera that minimises ``|scale * R[:, :2] @ centre(S) - centre(W)|`` over the visible points; the identity
         where they fix none (and scale 0 if that is free).
     """
-    X = centre(torch.cat([S, W], dim=1), visible) * visible[:, None]
-    X = X.double()  # in single precision what lies on one line would not look so
-    moments = (X @ X.transpose(1, 2)).cpu().numpy()
-    moments[~np.isfinite(moments).all((1, 2))] = 0.0  # a training that diverged: its loss will tell
-    poses = viewing_sphere.solve(moments, np.zeros(moments.shape[:2]), scale, rivals=False)
-    R, s = (torch.from_numpy(part[:, 0]).to(S) for part in (poses.R, poses.scale))
-    return Camera(R, s[:, None, None])
+    return solve_camera(S, W, visible, scale)
 
 
 def algebraic_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -> Camera:
@@ -125,19 +120,74 @@ def algebraic_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free
 
 def solve_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -> Camera:
     """The global optimum as a function of S and W that autograd can differentiate; see ``optimal_camera``."""
-    seen = visible[:, None].to(S.dtype)
-    n = optimal_camera(S, W, visible, scale).R[:, 2]
-    S, W = centre(S, visible) * seen, centre(W, visible) * seen
-    A, B = S @ S.transpose(1, 2), W @ S.transpose(1, 2)
-    return _pose(A, B, _unit(n + _newton_step(A, B, n, scale)), scale)
+    R, s = _Optimum.apply(S, W, visible, scale)
+    return Camera(R, s[:, None, None])
 
 
-def _unit(v: Tensor) -> Tensor:
-    return v / v.norm(dim=1, keepdim=True)
+class _Optimum(torch.autograd.Function):
+    """The best R (N,3,3) and scale (N,), with their derivatives by the implicit function theorem.
+
+    The cost |M S - W|^2 / 2 of M = s R_xy has no slope at the optimum.  Let it be moved to s e^v exp([w]x) R: the
+    slope in x = (w, v) is <M_i, D>, D = M A - B with A = S S^T and B = W S^T, and M_i what x_i does to M.  As moments
+    change the slope stays zero, and a loss whose gradient in x is g has, with u = H^-1 g and U = sum_i u_i M_i, the
+    gradient -M^T U in A and U in B.  In the camera's axes the cost's Hessian H is sparse: turns in the image plane and
+    the scale are coupled to tilts only, and are eliminated.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx, S: Tensor, W: Tensor, visible: Tensor, scale: Scale
+    ) -> tuple[Tensor, Tensor]:
+        X = torch.cat([S, W], dim=1).double()  # in single precision what lies on one line would not look so
+        X = centre(X, visible) * visible[:, None]
+        moments = (X @ X.transpose(1, 2)).cpu().numpy()
+        finite = np.isfinite(moments).all((1, 2))
+        if not finite.all():
+            moments[~finite] = 0.0  # a training that diverged: its loss will tell
+        poses = viewing_sphere.solve(moments, np.zeros(moments.shape[:2]), scale, rivals=False)
+        ctx.save_for_backward(X)
+        ctx.optimum = moments, poses.R[:, 0], poses.scale[:, 0], scale
+        return torch.from_numpy(poses.R[:, 0]).to(S), torch.from_numpy(poses.scale[:, 0]).to(S)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: torch.autograd.function.FunctionCtx, in_R: Tensor, in_s: Tensor) -> tuple[Tensor | None, ...]:
+        (X,) = ctx.saved_tensors
+        in_moments = _slope_in_moments(*ctx.optimum, *(part.double().cpu().numpy() for part in (in_R, in_s)))
+        in_X = torch.from_numpy(in_moments).to(X) @ X
+        return in_X[:, :3].to(in_R), in_X[:, 3:].to(in_R), None, None
 
 
-def _times(M: Tensor, v: Tensor) -> Tensor:
-    return (M @ v[..., None])[..., 0]
+def _slope_in_moments(
+    moments: np.ndarray, R: np.ndarray, s: np.ndarray, scale: Scale, in_R: np.ndarray, in_s: np.ndarray
+) -> np.ndarray:
+    """A loss's gradient in moments (N,5,5), summed with its transpose, from that in R (N,3,3) and s (N,)."""
+    M = s[:, None, None] * R
+    along = M.transpose(0, 2, 1)
+    A, B = M @ moments[:, :3, :3] @ along, moments[:, 3:, :3] @ along
+    twist = in_R @ R.transpose(0, 2, 1)
+    gx, gy, gz = (twist[:, i, j] - twist[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    g_size = in_s * s
+    p, q, r = (A[:, i, j] - B[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    ax, ay, across = A[:, 0, 2], A[:, 1, 2], A[:, 0, 0] + A[:, 1, 1]
+    over_roll = 1 / np.maximum(across - p - r, _TINY)
+    over_size = (scale == "free") / np.maximum(across, _TINY)
+    # Tilts (x, y) that remain once the roll z and the size have followed.
+    gx = gx + over_roll * ax * gz + over_size * ay * g_size
+    gy = gy + over_roll * ay * gz - over_size * ax * g_size
+    xx = A[:, 2, 2] - r - over_roll * ax * ax - over_size * ay * ay
+    yy = A[:, 2, 2] - p - over_roll * ay * ay - over_size * ax * ax
+    xy = q + (over_size - over_roll) * ax * ay
+    over = 1 / np.maximum(xx * yy - xy * xy, _FLAT * across * across + _TINY)
+    ux, uy = over * (yy * gx - xy * gy), over * (xx * gy - xy * gx)
+    uz = over_roll * (gz + ax * ux + ay * uy)
+    size = over_size * (g_size + ay * ux - ax * uy)
+    U = np.stack([size, -uz, uy, uz, size, -ux], axis=1).reshape(-1, 2, 3) @ M
+    in_A = -along[:, :, :2] @ U
+    found = np.zeros_like(moments)
+    found[:, :3, :3] = in_A + in_A.transpose(0, 2, 1)
+    found[:, 3:, :3], found[:, :3, 3:] = U, U.transpose(0, 2, 1)
+    return found
 
 
 def _trace(M: Tensor) -> Tensor:
@@ -148,68 +198,3 @@ def _affine_camera(A: Tensor, B: Tensor) -> Tensor:
     """(N,2,3) least-squares affine camera B A^-1, step 1 of the paper's solver."""
     ridge = _RIDGE * _trace(A).clamp_min(1e-9) * torch.eye(3, dtype=A.dtype, device=A.device)
     return torch.linalg.solve(A + ridge, B, left=False)
-
-
-def _goal(A: Tensor, B: Tensor, n: Tensor, scale: Scale) -> tuple[Tensor, Tensor]:
-    """Gradient (N,3) and Hessian (N,3,3) of the goal at its optima n; docs/onp.md has A, B, c, D, T and the goals."""
-    c, D = torch.linalg.cross(B[:, 0], B[:, 1]), B.transpose(1, 2) @ B
-    An, Dn = _times(A, n), _times(D, n)
-    T = (_trace(D)[:, 0, 0] + (n * (2 * c - Dn)).sum(1)).clamp_min(1e-18)[:, None]
-    dT = 2 * (c - Dn)
-    if scale == "unit":
-        root = T.sqrt()
-        twist = dT[:, :, None] * dT[:, None] / (2 * T * root)[..., None]
-        return 2 * An + dT / root, 2 * A - 2 * D / root[..., None] - twist
-    across = (_trace(A)[:, 0] - (n * An).sum(1, keepdim=True)).clamp_min(1e-9)
-    g = T / across
-    dg = (dT + 2 * g * An) / across
-    # The products of the two slopes are left out: at an optimum they vanish across n.
-    return dg, 2 * (g[..., None] * A - D) / across[..., None]
-
-
-def _newton_step(A: Tensor, B: Tensor, n: Tensor, scale: Scale) -> Tensor:
-    """Newton step (N,3), tangent to n, towards the maximum of the goal."""
-    dg, hessian = _goal(A, B, n, scale)
-    E = _tangent(n)
-    slope = _times(E.transpose(1, 2), dg)
-    bend = E.transpose(1, 2) @ hessian @ E
-    pull = (n * dg).sum(1)
-    a, b, d = bend[:, 0, 0] - pull, bend[:, 0, 1], bend[:, 1, 1] - pull
-    shift = _shift(a.detach(), b.detach(), d.detach())
-    a, d = a - shift, d - shift
-    along = torch.stack([b * slope[:, 1] - d * slope[:, 0], b * slope[:, 0] - a * slope[:, 1]], 1)
-    return _times(E, along / (a * d - b * b).clamp_min(1e-12)[:, None])
-
-
-def _shift(a: Tensor, b: Tensor, d: Tensor) -> Tensor:
-    """What to take off the diagonal of [[a, b], [b, d]] to make it negative definite, 0 where it is."""
-    middle, radius = (a + d) / 2, torch.hypot((a - d) / 2, b)
-    top, bottom = middle + radius, middle - radius
-    return torch.where(top < 0, torch.zeros_like(top), top + 0.1 * bottom.abs() + 1e-6)
-
-
-def _tangent(n: Tensor) -> Tensor:
-    """(N,3,2) orthonormal basis of the plane across n (Duff et al., JCGT 2017)."""
-    x, y, z = n.unbind(1)
-    sign = torch.copysign(torch.ones_like(z), z)
-    a = -1 / (sign + z)
-    b = x * y * a
-    return torch.stack([1 + sign * x * x * a, b, sign * b, sign + y * y * a, -sign * x, -y], 1).view(-1, 3, 2)
-
-
-def _pose(A: Tensor, B: Tensor, n: Tensor, scale: Scale) -> Camera:
-    """The best pose that looks along n."""
-    # Built from n itself, not from a frozen basis, so that gradients reach both rows.
-    first = _tangent(n.detach())[..., 0]
-    e1 = _unit(first - n * (first * n).sum(1, keepdim=True))
-    e2 = torch.linalg.cross(n, e1)
-    real = (e1 * B[:, 0]).sum(1) + (e2 * B[:, 1]).sum(1)
-    imaginary = (e1 * B[:, 1]).sum(1) - (e2 * B[:, 0]).sum(1)
-    size = (real.square() + imaginary.square()).clamp_min(1e-18).sqrt()
-    cos = torch.where(size > 1e-9, real / size, torch.ones_like(size))[:, None]  # some rotation where any will do
-    sin = torch.where(size > 1e-9, imaginary / size, torch.zeros_like(size))[:, None]
-    R = torch.stack([cos * e1 - sin * e2, sin * e1 + cos * e2, n], 1)
-    if scale == "unit":
-        return Camera(R, torch.ones_like(size)[:, None, None])
-    across = _trace(A)[:, 0, 0] - (n * _times(A, n)).sum(1)
-    return Camera(R, (size / across.clamp_min(1e-9))[:, None, None])

@@ -27,7 +27,7 @@ from paul_ros.skeleton import Layout
 from training import starting
 from training.data import TrainingData
 from training.distributed import Share, from_first, is_first, processes, share_of
-from training.networks import Paul, build_networks
+from training.networks import Paul, build_networks, main_axis
 from training.objective import Terms, Views, paul_terms, regression_terms
 from training.recipe import Recipe
 from training.starting import START_UNIT, Lesson, Progress, Start, StartError, kept_start
@@ -99,10 +99,13 @@ class Trainer:
         self.data, self.recipe, self.folder, self.device = data, recipe, folder, torch.device(device)
         if processes() > len(data.W) or 0 < recipe.batch < processes():
             raise TrainingError(f"{processes()} processes cannot share a batch of fewer frames: start fewer")
+        self._W = torch.from_numpy(data.W).to(self.device)
+        self._visible = torch.from_numpy(data.visible).to(self.device)
+        self._mirror = torch.tensor(data.layout.mirror, device=self.device)
         self.generator = torch.Generator().manual_seed(recipe.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.seed)
-            self.networks = build_networks(data.layout, recipe, len(data.W)).to(self.device)
+            self.networks = build_networks(data.layout, recipe, len(data.W), self._axis()).to(self.device)
         self.optimizer = self._optimizer()
         self._objective: nn.Module = _Objective(self.networks, data.layout, recipe)
         if processes() > 1:
@@ -111,9 +114,10 @@ class Trainer:
         self.step, self.seconds, self.rows = 0, 0.0, []
         self.stopped = False
         self._window = [0, 0.0, math.inf]  # steps and losses since the last look at them, and the mean before it
-        self._W = torch.from_numpy(data.W).to(self.device)
-        self._visible = torch.from_numpy(data.visible).to(self.device)
-        self._mirror = torch.tensor(data.layout.mirror, device=self.device)
+
+    def _axis(self) -> Tensor | None:
+        """What h turns views by, if the recipe asks for it."""
+        return main_axis(self.views(torch.arange(len(self.data.W))).W) if self.recipe.upright else None
 
     @property
     def checkpoint(self) -> Path:
@@ -252,9 +256,9 @@ class Trainer:
         for part in idle:
             part.requires_grad_(False)
         weights = [w for w in self.networks.parameters() if w.requires_grad and not any(w is code for code in codes)]
-        groups = [{"params": weights, "peak": self.recipe.learning_rate}]
+        groups = [{"params": [one_buffer(weights)], "peak": self.recipe.learning_rate}]
         if codes:
-            groups.append({"params": codes, "peak": self.recipe.code_learning_rate})
+            groups.append({"params": [one_buffer(codes)], "peak": self.recipe.code_learning_rate})
         return torch.optim.Adam(groups, lr=self.recipe.learning_rate, fused=True)
 
     def _advance(self, begun: float) -> dict[str, float | str]:
@@ -270,10 +274,12 @@ class Trainer:
                 f"the loss is {loss} at step {self.step}: lower learning_rate in the recipe, "
                 f"and look for frames with wrong points in '{self.data.source}'"
             )
-        self.optimizer.zero_grad(set_to_none=True)
+        trained = [weights for group in self.optimizer.param_groups for weights in group["params"]]
+        for weights in trained:
+            weights.grad.zero_()
         terms.loss.backward()
         limit = _GRADIENT_LIMIT * self.data.W.shape[2] ** 0.5
-        torch.nn.utils.clip_grad_norm_(self.networks.parameters(), limit)
+        torch.nn.utils.clip_grad_norm_(trained, limit)
         self.optimizer.step()
         self.step += 1
         self.seconds = time.monotonic() - begun
@@ -321,7 +327,7 @@ class Trainer:
         size = recipe.batch or pool
         chosen = torch.randint(pool, (size,), generator=self.generator) if recipe.batch else torch.arange(pool)
         rows = (chosen if phase == UNSUPERVISED else self._lesson.rows[chosen]).to(self.device)
-        W, visible = self._W[rows], self._visible[rows]
+        W, visible = self._W.index_select(0, rows), self._visible.index_select(0, rows)  # faster than [rows]
         exchanged = None
         if recipe.mirror_object:
             exchanged = (self._uniform(size) < 0.5)[:, None, None]
@@ -330,10 +336,13 @@ class Trainer:
         if recipe.hide:
             fewer = visible & (self._uniform(size, visible.shape[1]) >= recipe.hide * self._uniform(size, 1))
             visible = torch.where(enough_visible(fewer, self.data.layout)[:, None], fewer, visible)
-        turn, facing = self._turns(size)
+        facing = torch.ones(size, 1, 1, device=self.device)
+        if recipe.roll or recipe.mirror_view:
+            turn, facing = self._turns(size)
+            W = turn @ W
         share = share_of(size)
         goal = None if phase == UNSUPERVISED else self._lesson.shapes_of(chosen, exchanged)[share.part]
-        return self._seen(turn @ W, visible, facing)[share.part], rows[share.part], goal, share
+        return self._seen(W, visible, facing)[share.part], rows[share.part], goal, share
 
     def _turns(self, size: int) -> tuple[Tensor, Tensor]:
         """Random in-plane turns (N,2,2), half of them mirrored in x where the recipe says so; (N,1,1) is -1 for those.
@@ -372,6 +381,21 @@ class Trainer:
                 f"'{self.folder}' holds a run with another {' and '.join(other)}: "
                 f"start over with --fresh, or choose another output"
             )
+
+
+def one_buffer(parameters: list[nn.Parameter]) -> nn.Parameter:
+    """All parameters in one vector that they and their gradients are views of from here on.
+
+    An optimiser's step then costs one tensor's calls, where networks this small would wait for dozens.
+    """
+    buffer = nn.Parameter(nn.utils.parameters_to_vector(parameters).detach().clone())
+    buffer.grad = torch.zeros_like(buffer)
+    begin = 0
+    for parameter in parameters:
+        part = slice(begin, begin + parameter.numel())
+        begin = part.stop
+        parameter.data, parameter.grad = (x[part].view_as(parameter) for x in (buffer.data, buffer.grad))
+    return buffer
 
 
 def turned_views(angle: Tensor, mirrored: Tensor) -> tuple[Tensor, Tensor]:
