@@ -12,6 +12,7 @@ Sigma is annealed by the caller and never learned: learned, it runs away from go
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -63,14 +64,9 @@ class Observations:
         return bool(self.visible.all())
 
     @cached_property
-    def patterns(self) -> Tensor:
-        """(F,P) float64 visibility, or (1,P) where nothing is hidden."""
-        return (self.visible[:1] if self.complete else self.visible).double()
-
-    @cached_property
     def count(self) -> Tensor:
-        """(F,) visible points."""
-        return self.visible.sum(1)
+        """(F,) number of visible points, float64."""
+        return self.visible.sum(1).double()
 
     @cached_property
     def products(self) -> Tensor:
@@ -105,31 +101,41 @@ class Posterior:
         return E
 
 
-class Moments:
+class Moments(ABC):
     """Products of the bases with each other and with the frames: all that cameras and codes depend on.
 
-    Their size does not depend on the number of points, so that scoring many cameras is cheap.
+    Two kinds: where nothing is hidden the frames share the products of the bases; else each has its own.
     """
 
     def __init__(self, seen: Observations, V: Tensor) -> None:
-        self.seen, self.bases = seen, len(V)
-        flat = V.flatten(0, 1)
-        if seen.complete:
-            flat = flat - flat.mean(1, keepdim=True)
-            second = (flat @ flat.T)[None]
-        else:
-            second = seen.patterns @ (flat[:, None] * flat[None]).flatten(0, 1).T
-            middle = seen.patterns @ flat.T
-            second = second.unflatten(1, (len(flat), -1))
-            second = second - middle[:, :, None] * middle[:, None] / seen.count[:, None, None]
-        # (F or 1, 9, (K+1)^2): the products of coordinates i and j of bases k and l at [3 i + j, (K+1) k + l].
-        blocks = second.unflatten(2, (-1, 3)).unflatten(1, (-1, 3)).permute(0, 2, 4, 1, 3)
-        self.second = blocks.reshape(len(second), 9, self.bases**2)
-        self.cross = (seen.W.flatten(0, 1) @ flat.T).unflatten(0, (-1, 2)).unflatten(2, (-1, 3))  # (F,2,K+1,3)
+        self.seen, self.V, self.bases = seen, V, len(V)
+        # (F,2,K+1,3): image axes against the coordinates of the bases.
+        self.cross = (seen.W.flatten(0, 1) @ V.flatten(0, 1).T).unflatten(0, (-1, 2)).unflatten(2, (-1, 3))
+
+    @staticmethod
+    def of(seen: Observations, V: Tensor) -> Moments:
+        """Those of bases V (K+1,3,P)."""
+        return (_SharedMoments if seen.complete else _OwnMoments)(seen, V)
+
+    @abstractmethod
+    def gram(self, R: Tensor) -> Tensor:
+        """Products (F,K+1,K+1) of the bases as seen by cameras R (F,3,3)."""
+
+    @abstractmethod
+    def scores(self, R: Tensor, sigma: float) -> Tensor:
+        """Negative log likelihoods (N,F) of every frame under every one of the cameras R (N,3,3)."""
+
+    @abstractmethod
+    def spread(self, posterior: Posterior) -> Tensor:
+        """Expected products (F,3,3) of the coordinates of the shapes."""
+
+    @abstractmethod
+    def beside(self, code: Tensor) -> Tensor:
+        """Products (F,3,K+1,3) of the bases' coordinates (first) with those of the shape of codes (F,K+1) (last)."""
 
     def posterior(self, R: Tensor, sigma: float) -> Posterior:
         """Codes and likelihoods of frames seen by cameras R (F,3,3)."""
-        H, h, rest = self._system(R, sigma)
+        H, h, rest = self._system(self.gram(R), R, sigma)
         inverse, log_det = _inverse(H)
         mean = (inverse @ h[..., None])[..., 0]
         return Posterior(mean, sigma**2 * inverse, self._nll(log_det, rest - (h * mean).sum(1), sigma))
@@ -143,7 +149,7 @@ class Moments:
         Gradients of factorisations are slow, and none are needed: a quadratic form at its optimum has the gradient of
         the form with the optimum held, and one Newton step there carries the gradient of the optimum itself.
         """
-        H, h, rest = self._system(R, sigma)
+        H, h, rest = self._system(self.gram(R), R, sigma)
         with torch.no_grad():
             inverse, log_det = _inverse(H)
             held = inverse @ h[..., None]
@@ -153,40 +159,24 @@ class Moments:
         own, others = self._turning(R, code)
         Y = inverse @ others.detach()
         J = own - 2 * Y.transpose(1, 2) @ others + Y.transpose(1, 2) @ H @ Y
-        J = (J + J.transpose(1, 2)) / (2 * sigma**2) + _RIDGE * torch.eye(3, dtype=J.dtype)
+        J = (J + J.transpose(1, 2)) / (2 * sigma**2)
+        # Points on one line tell no turn about it: a ridge above rounding, whatever the noise.
+        ridge = _RIDGE * (1 + J.diagonal(dim1=1, dim2=2).sum(1))
+        J = J + ridge[:, None, None] * torch.eye(3, dtype=J.dtype)
         return self._nll(log_det, misfit, sigma) + 0.5 * torch.logdet(J)
-
-    def scores(self, R: Tensor, sigma: float) -> Tensor:
-        """Negative log likelihoods (N,F) of every frame under every one of the cameras R (N,3,3)."""
-        if not self.seen.complete:
-            return torch.stack([self.posterior(one.expand(len(self.seen), 3, 3), sigma).nll for one in R])
-        G = self._contracted(R)
-        along = torch.einsum("nai,faki->nfk", R[:, :2], self.cross)
-        H = G[:, 1:, 1:] + sigma**2 * torch.eye(self.bases - 1, dtype=G.dtype)
-        inverse, log_det = _inverse(H)
-        h = along[:, :, 1:] - G[:, None, 0, 1:]
-        rest = self.seen.power - 2 * along[:, :, 0] + G[:, :1, 0]
-        return self._nll(log_det[:, None], rest - (h * (h @ inverse)).sum(2), sigma)
 
     def best_rotations(self, posterior: Posterior) -> Tensor:
         """Cameras (F,3,3) of the highest expected likelihood: exact orthographic-N-point on expected moments."""
-        frames = len(self.seen)
-        A = (self.second @ posterior.second.reshape(frames, -1, 1)).view(-1, 3, 3)
+        A = self.spread(posterior)
         B = torch.einsum("fk,faki->fai", with_one(posterior.mean), self.cross)
         upper = torch.cat([(A + A.transpose(1, 2)) / 2, B.transpose(1, 2)], 2)
         moments = torch.cat([upper, torch.cat([B, self.seen.products], 2)], 1).numpy()
-        poses = viewing_sphere.solve(moments, np.zeros((frames, 5)), "unit", rivals=False)
+        poses = viewing_sphere.solve(moments, np.zeros((len(moments), 5)), "unit", rivals=False)
         return torch.from_numpy(poses.R[:, 0])
 
-    def _contracted(self, R: Tensor) -> Tensor:
-        """Products (N,K+1,K+1) of the bases as seen by cameras (N,3,3)."""
-        Q = (R[:, :2].transpose(1, 2) @ R[:, :2]).flatten(1)
-        G = Q @ self.second[0] if len(self.second) == 1 else (Q[:, None] @ self.second)[:, 0]
-        return G.unflatten(1, (self.bases, self.bases))
-
-    def _system(self, R: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
+    def _system(self, G: Tensor, R: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
         """Of the codes: matrix H (F,K,K), right side h (F,K); and the squared norm (F,) of what the mean leaves."""
-        G, along = self._contracted(R), torch.einsum("fai,faki->fk", R[:, :2], self.cross)
+        along = torch.einsum("fai,faki->fk", R[:, :2], self.cross)
         H = G[:, 1:, 1:] + sigma**2 * torch.eye(self.bases - 1, dtype=G.dtype)
         return H, along[:, 1:] - G[:, 0, 1:], self.seen.power - 2 * along[:, 0] + G[:, 0, 0]
 
@@ -200,18 +190,93 @@ class Moments:
         T_x = (0, -z), T_y = (z, 0), T_z = (-y, x): among each other (F,3,3), and with the bases (F,K,3).
         """
         c = with_one(code)
-        frames = len(c)
-        blocks = self.second.unflatten(2, (self.bases, self.bases))
-        mixed = (
-            torch.einsum("qkl,fl->fkq", blocks[0], c) if len(blocks) == 1 else torch.einsum("fqkl,fl->fkq", blocks, c)
-        )
-        D = R[:, None] @ mixed.view(frames, -1, 3, 3) @ R[:, None].transpose(2, 3)  # base k against the shape
-        C = (c[:, :, None, None] * D).sum(1)
-        zero = torch.zeros(frames, dtype=C.dtype)
+        # (F,3,K+1,3): camera coordinates of the bases against those of the shape; and of the shape against itself.
+        half = (R @ self.beside(c).flatten(2)).unflatten(2, (-1, 3)).flatten(1, 2)
+        D = (half @ R.transpose(1, 2)).unflatten(1, (3, -1))
+        C = torch.einsum("fk,fakb->fab", c, D)
+        zero = torch.zeros(len(c), dtype=C.dtype)
         xx, yy, zz, xz, yz = C[:, 0, 0], C[:, 1, 1], C[:, 2, 2], C[:, 0, 2], C[:, 1, 2]
         own = torch.stack([zz, zero, -xz, zero, zz, -yz, -xz, -yz, xx + yy], 1).view(-1, 3, 3)
-        others = torch.stack([-D[..., 1, 2], D[..., 0, 2], D[..., 1, 0] - D[..., 0, 1]], 2)
-        return own, others[:, 1:]
+        x, y = D[:, 0, 1:], D[:, 1, 1:]
+        return own, torch.stack([-y[..., 2], x[..., 2], y[..., 0] - x[..., 1]], 2)
+
+
+class _SharedMoments(Moments):
+    """Nothing is hidden. The products' size does not depend on the number of points."""
+
+    def __init__(self, seen: Observations, V: Tensor) -> None:
+        super().__init__(seen, V)
+        flat = _centred(V).flatten(0, 1)
+        # (K+1,3,K+1,3)
+        self._blocks = (flat @ flat.T).unflatten(1, (-1, 3)).unflatten(0, (-1, 3))
+
+    @cached_property
+    def _by_axes(self) -> Tensor:
+        """(9,(K+1)^2): the products of coordinates i and j of bases k and l at [3 i + j, (K+1) k + l]."""
+        return self._blocks.permute(1, 3, 0, 2).reshape(9, -1)
+
+    def gram(self, R: Tensor) -> Tensor:
+        return (_planes(R).flatten(1) @ self._by_axes).unflatten(1, (self.bases, self.bases))
+
+    def scores(self, R: Tensor, sigma: float) -> Tensor:
+        G = self.gram(R)
+        along = torch.einsum("nai,faki->nfk", R[:, :2], self.cross)
+        inverse, log_det = _inverse(G[:, 1:, 1:] + sigma**2 * torch.eye(self.bases - 1, dtype=G.dtype))
+        h = along[:, :, 1:] - G[:, None, 0, 1:]
+        rest = self.seen.power - 2 * along[:, :, 0] + G[:, :1, 0]
+        return self._nll(log_det[:, None], rest - (h * (h @ inverse)).sum(2), sigma)
+
+    def spread(self, posterior: Posterior) -> Tensor:
+        return (posterior.second.flatten(1) @ self._by_axes.T).unflatten(1, (3, 3))
+
+    def beside(self, code: Tensor) -> Tensor:
+        by_last = self._blocks.permute(2, 1, 0, 3)
+        return (code @ by_last.flatten(1)).unflatten(1, by_last.shape[1:])
+
+
+class _OwnMoments(Moments):
+    """Each frame has its own visible points. Images are made anew each time: products a frame would be larger."""
+
+    def __init__(self, seen: Observations, V: Tensor) -> None:
+        super().__init__(seen, V)
+        self._pattern = seen.visible.double()
+        # (F,K+1,3) sums over the visible points.
+        self._sums = torch.einsum("fp,kip->fki", self._pattern, V)
+
+    def gram(self, R: Tensor) -> Tensor:
+        images = (R[:, :2].flatten(0, 1) @ self.V.transpose(0, 1).flatten(1)).view(len(R), 2, self.bases, -1)
+        images = (images * self._pattern[:, None, None]).transpose(1, 2).flatten(2)
+        sums = self._sums @ R[:, :2].transpose(1, 2)
+        return images @ images.transpose(1, 2) - sums @ sums.transpose(1, 2) / self.seen.count[:, None, None]
+
+    def scores(self, R: Tensor, sigma: float) -> Tensor:
+        found = []
+        for one in R:
+            H, h, rest = self._system(self._gram_of_one(one), one.expand(len(self.seen), 3, 3), sigma)
+            inverse, log_det = _inverse(H)
+            found.append(self._nll(log_det, rest - (h[:, None] @ inverse @ h[..., None]).flatten(), sigma))
+        return torch.stack(found)
+
+    def spread(self, posterior: Posterior) -> Tensor:
+        E = posterior.second
+        pairs = torch.einsum("kip,ljp->klpij", self.V, self.V)
+        local = (E.flatten(1) @ pairs.flatten(2).flatten(0, 1)).view(len(E), -1, 9)
+        A = (self._pattern[:, None] @ local).unflatten(2, (3, 3))[:, 0]
+        return A - self._sums.transpose(1, 2) @ E @ self._sums / self.seen.count[:, None, None]
+
+    def beside(self, code: Tensor) -> Tensor:
+        S = (code @ self.V.flatten(1)).view(len(code), 3, -1)
+        S = S - torch.einsum("fk,fki->fi", code, self._sums)[..., None] / self.seen.count[:, None, None]
+        S = S * self._pattern[:, None]
+        products = S.flatten(0, 1) @ self.V.transpose(0, 1).flatten(0, 1).T
+        return products.view(len(code), 3, 3, self.bases).permute(0, 2, 3, 1)
+
+    def _gram_of_one(self, R: Tensor) -> Tensor:
+        """As ``gram``, of all frames by one camera R (3,3)."""
+        images, sums = R[:2] @ self.V, self._sums @ R[:2].T
+        pairs = torch.einsum("kap,lap->klp", images, images).flatten(0, 1)
+        G = (self._pattern @ pairs.T).unflatten(1, (self.bases, self.bases))
+        return G - sums @ sums.transpose(1, 2) / self.seen.count[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -240,7 +305,7 @@ class LinearModel:
 
     def posterior(self, seen: Observations, sigma: float) -> Posterior:
         """Codes and likelihoods of the frames."""
-        return Moments(seen, self.V).posterior(self.R, sigma)
+        return Moments.of(seen, self.V).posterior(self.R, sigma)
 
     def shapes(self, posterior: Posterior) -> Tensor:
         """Expected shapes (F,3,P), canonical frame."""
@@ -250,7 +315,7 @@ class LinearModel:
         """One step of expectation maximisation: bases, cameras, and codes made white again."""
         posterior = self.posterior(seen, sigma)
         model = replace(self, V=_best_bases(self, seen, posterior, sigma, penalty))
-        moments = Moments(seen, model.V)
+        moments = Moments.of(seen, model.V)
         model = replace(model, R=moments.best_rotations(moments.posterior(model.R, sigma)))
         return replace(model, V=_whitened(model.V, moments.posterior(model.R, sigma)))
 
@@ -258,7 +323,7 @@ class LinearModel:
         self, seen: Observations, sigma: float, generator: np.random.Generator, count: int = 200, best: int = 3
     ) -> LinearModel:
         """With every camera searched for globally: random rotations scored by likelihood, the best few refined."""
-        moments = Moments(seen, self.V)
+        moments = Moments.of(seen, self.V)
         candidates = random_rotations(count, generator)
         chosen = moments.scores(candidates, sigma).topk(best, dim=0, largest=False).indices
         R, nll = self.R, moments.posterior(self.R, sigma).nll
@@ -285,7 +350,7 @@ class LinearModel:
 
         def evaluate() -> Tensor:
             optimizer.zero_grad()
-            nll = Moments(seen, V).marginal_nll(rotations_of(turn) @ self.R, sigma)
+            nll = Moments.of(seen, V).marginal_nll(rotations_of(turn) @ self.R, sigma)
             loss = nll.mean() + penalty * V.square().sum() / (3 * seen.points)
             loss.backward()
             return loss
@@ -295,7 +360,7 @@ class LinearModel:
 
     def objective(self, seen: Observations, sigma: float, penalty: float) -> float:
         """Mean negative log likelihood of a frame, plus the penalty on the size of the bases."""
-        nll = Moments(seen, self.V).marginal_nll(self.R, sigma).mean()
+        nll = Moments.of(seen, self.V).marginal_nll(self.R, sigma).mean()
         return float(nll + penalty * self.V.square().sum() / (3 * seen.points))
 
 
@@ -326,10 +391,20 @@ def with_one(code: Tensor) -> Tensor:
     return torch.cat([torch.ones_like(code[:, :1]) if code.shape[1] else code.new_ones(len(code), 1), code], 1)
 
 
+def _planes(R: Tensor) -> Tensor:
+    """(N,3,3) projections onto the image planes of cameras (N,3,3)."""
+    return R[:, :2].transpose(1, 2) @ R[:, :2]
+
+
 def _inverse(H: Tensor) -> tuple[Tensor, Tensor]:
     """Inverses and log determinants of positive definite matrices (N,K,K)."""
     L = torch.linalg.cholesky(H)
-    return torch.cholesky_inverse(L), 2 * L.diagonal(dim1=1, dim2=2).log().sum(1)
+    return torch.cholesky_inverse(L), _log_det(L)
+
+
+def _log_det(L: Tensor) -> Tensor:
+    """Log determinants (N,) of matrices by their Cholesky factors (N,K,K)."""
+    return 2 * L.diagonal(dim1=1, dim2=2).log().sum(1)
 
 
 def _centred(V: Tensor) -> Tensor:
@@ -342,20 +417,19 @@ def _best_bases(model: LinearModel, seen: Observations, posterior: Posterior, si
     The translation of a frame with hidden points moves with its code: t = -R (mean of the visible points of V) (1, c).
     """
     bases, _, points = model.V.shape
-    size, R, E = 3 * bases, model.R[:, :2], posterior.second
-    Q = R.transpose(1, 2) @ R
-    per_frame = (E[:, :, None, :, None] * Q[:, None, :, None, :]).reshape(len(seen), size * size)
+    size, R, E, Q = 3 * bases, model.R[:, :2], posterior.second, _planes(model.R)
     right = torch.einsum("fk,fip->kip", with_one(posterior.mean), R.transpose(1, 2) @ seen.W).reshape(size, points)
     ridge = (2 * penalty / (3 * points) * sigma**2 * len(seen) + _RIDGE) * torch.eye(size, dtype=right.dtype)
-    if seen.complete:
-        left = per_frame.sum(0).view(size, size) + ridge
-        return _centred(torch.linalg.solve(left, right).view(bases, 3, points))
     visible = seen.visible.double()
-    middle = torch.einsum("fp,kip->fki", visible / seen.count[:, None], model.V)
-    pull = (E @ middle @ Q).reshape(-1, size)
-    right = right + pull.T @ visible
-    left = (visible.T @ per_frame).view(points, size, size) + ridge
-    return _centred(torch.linalg.solve(left, right.T[..., None])[..., 0].T.reshape(bases, 3, points))
+    if not seen.complete:
+        middle = torch.einsum("fp,kip->fki", visible / seen.count[:, None], model.V)
+        right = right + (E @ middle @ Q).reshape(-1, size).T @ visible
+    weights = (visible[:, :1] if seen.complete else visible)[..., None] * Q.flatten(1)[:, None]
+    left = (weights.flatten(1).T @ E.flatten(1)).view(-1, 3, 3, bases, bases)
+    left = left.permute(0, 3, 1, 4, 2).reshape(-1, size, size) + ridge
+    # One system for all points, or one a point.
+    flat = torch.linalg.solve(left[0], right) if seen.complete else torch.linalg.solve(left, right.T).T
+    return _centred(flat.reshape(bases, 3, points))
 
 
 def _whitened(V: Tensor, posterior: Posterior) -> Tensor:

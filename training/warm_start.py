@@ -14,21 +14,24 @@ A linear model with much noise has few minima; the noise is then lowered step by
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from training.linear_model import LinearModel, Moments, Observations, random_rotations
+from training.starting import Progress, StartError
 
-Progress = Callable[[float], None]
+Array = TypeVar("Array", np.ndarray, Tensor)
 
 _STARTS = 48
 _START_FRAMES = 300
 _MAX_FRAMES = 1500
 _MAX_POINTS = 256
+_MIN_VISIBLE = 3
 _CANDIDATES = 4
 _SAME_BASIN = 0.1  # nats a frame
 _BASES = (6, 10, 30)  # K of the starts, the candidates and the detail
@@ -59,6 +62,18 @@ class Start(NamedTuple):
     score: float
 
 
+@contextmanager
+def _breakdown_explained() -> Iterator[None]:
+    try:
+        yield
+    except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
+        raise StartError(
+            "the search for a start broke down on these image points: look for wild ones among them, "
+            f"or choose start: random ({error})"
+        ) from error
+
+
+@_breakdown_explained()
 def linear_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progress | None = None) -> Start:
     """Shapes of up to 1500 frames by the linear model.
 
@@ -67,9 +82,19 @@ def linear_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progre
         visible: (F,P) bool.
         seed: of the random starts.
         progress: is told the share of the work that is done, 0 to 1.
+
+    Raises:
+        StartError: fewer than two frames show three points, or the numbers are too wild.
     """
     generator, tell = np.random.default_rng(seed), progress or (lambda done: None)
-    rows, points = _chosen(len(W), _MAX_FRAMES, generator), _chosen(W.shape[2], _MAX_POINTS, generator)
+    points = _chosen(W.shape[2], _MAX_POINTS, generator)
+    usable = np.flatnonzero(visible[:, points].sum(1) >= _MIN_VISIBLE)
+    if len(usable) < 2:
+        raise StartError(
+            f"only {len(usable)} of {len(W)} frames show {_MIN_VISIBLE} points and more, a start needs two: "
+            "give more data, or choose start: random"
+        )
+    rows = usable[_chosen(len(usable), _MAX_FRAMES, generator)]
     seen = Observations.of(W[np.ix_(rows, [0, 1], points)], visible[np.ix_(rows, points)])
     basin = find_basin(seen, generator, lambda done: tell(0.5 * done))
     score = basin.objective(seen, _CANDIDATE[-1][0], 0.0)
@@ -80,6 +105,7 @@ def linear_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progre
     return Start(rows, shapes, rotations, score)
 
 
+@_breakdown_explained()
 def rigid_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progress | None = None) -> Start:
     """One rigid shape for all frames, by the same search without bases; a baseline. Arguments as ``linear_start``."""
     generator, tell = np.random.default_rng(seed), progress or (lambda done: None)
@@ -91,7 +117,7 @@ def rigid_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progres
         models.append(model.polished(seen, 0.3, 0.0, 100))
         tell((number + 1) / _CANDIDATES)
     best = min(models, key=lambda model: model.objective(seen, 0.3, 0.0))
-    shapes = np.repeat(best.V.numpy(), len(seen), axis=0)
+    shapes = _centred(best.V.expand(len(seen), -1, -1), seen.visible).numpy()
     return Start(np.arange(len(seen)), shapes, best.R.numpy(), best.objective(seen, 0.3, 0.0))
 
 
@@ -177,7 +203,7 @@ def _fitted_to(half: np.ndarray, model: LinearModel, seen: Observations, sigma: 
     fitted = LinearModel(model.V, model.R[half]).polished(seen[half], sigma, 0.0, iterations)
     R = model.R.clone()
     R[half] = fitted.R
-    moments = Moments(seen, fitted.V)
+    moments = Moments.of(seen, fitted.V)
     for _ in range(_SETTLING):
         R = moments.best_rotations(moments.posterior(R, sigma))
     return LinearModel(fitted.V, R)
@@ -185,9 +211,13 @@ def _fitted_to(half: np.ndarray, model: LinearModel, seen: Observations, sigma: 
 
 def _as_seen(model: LinearModel, seen: Observations, sigma: float) -> Tensor:
     """Expected shapes (F,3,P) in camera frame, centred on the visible points."""
-    S = model.R @ model.shapes(model.posterior(seen, sigma))
-    shown = seen.visible[:, None]
-    return S - torch.where(shown, S, 0.0).sum(2, keepdim=True) / shown.sum(2, keepdim=True)
+    return _centred(model.R @ model.shapes(model.posterior(seen, sigma)), seen.visible)
+
+
+def _centred(S: Array, visible: Array) -> Array:
+    """Shapes (F,3,P), tensor or array, about the means of their visible (F,P) points."""
+    shown = visible[:, None]
+    return S - (S * shown).sum(2, keepdims=True) / shown.sum(2, keepdims=True)
 
 
 def _observed(view: Tensor, seen: Observations) -> Tensor:
@@ -230,9 +260,7 @@ def _extended(
         left = (mask.T @ products).reshape(-1, size, size) + _EXTENSION_RIDGE * np.eye(size)
         right = D.reshape(2 * frames, size).T @ image.reshape(2 * frames, -1)
         V[block] = np.linalg.solve(left, right.T[..., None])[..., 0]
-    full = np.einsum("fk,pki->fip", codes, V.reshape(total, -1, 3), optimize=True)
-    seen = visible[:, None]
-    return full - np.where(seen, full, 0.0).sum(2, keepdims=True) / seen.sum(2, keepdims=True)
+    return _centred(np.einsum("fk,pki->fip", codes, V.reshape(total, -1, 3), optimize=True), visible)
 
 
 def _codes(shapes: np.ndarray) -> np.ndarray:
