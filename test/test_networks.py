@@ -213,3 +213,35 @@ def test_categories_are_centred_and_measured_each_by_itself(seed, edges):
             np.testing.assert_allclose(np.mean(sizes, axis=0), 1, rtol=1e-6)
         else:
             np.testing.assert_allclose((own**2).sum((1, 2)) / len(points), 1)
+
+
+# --- decoder and shape encoder as one function of autograd's
+
+
+def plain(layers, x):
+    *inner, last = layers
+    for layer in inner:
+        x = torch.nn.functional.elu(layer(x))
+    return last(x)
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+def test_layers_and_their_gradients_are_those_of_linear_and_elu(dtype, tolerance):
+    encoder = networks()[0].shape_encoder.to(dtype)
+    S = (5 * torch.randn(6, 3, 17, dtype=dtype)).requires_grad_()
+    ours, other = encoder(S), plain(encoder, S.flatten(1))
+    torch.testing.assert_close(ours, other, rtol=tolerance, atol=tolerance)
+    slope, inputs = torch.randn_like(ours), (S, *encoder.parameters())
+    for a, b in zip(*(torch.autograd.grad(codes, inputs, slope) for codes in (ours, other))):
+        torch.testing.assert_close(a, b, rtol=10 * tolerance, atol=10 * tolerance)
+
+
+def test_gradients_of_the_layers_against_finite_differences():
+    encoder = networks(hidden=[5])[0].shape_encoder.double()
+    S = torch.randn(2, 3, 17, dtype=torch.double, requires_grad=True)
+    assert torch.autograd.gradcheck(encoder, S)
+
+
+def test_what_is_no_number_stays_none():
+    decoder = networks()[0].decoder
+    assert decoder(torch.full((1, 3), torch.nan)).isnan().all()

@@ -142,9 +142,13 @@ def test_collapsed_shapes_get_rotations_all_the_same(scale, solver):
     along = torch.randn(60, 3, 1, generator=torch.Generator().manual_seed(0))
     line, point = along * torch.linspace(-1, 1, 12), along.expand(60, 3, 12)
     for shape in (line, point, 1e-6 * S.float()):
+        shape = shape.clone().float().requires_grad_()
         found = solver(shape, W.float(), visible, scale)
         torch.testing.assert_close(torch.linalg.det(found.R), torch.ones(60), atol=1e-4, rtol=0)
         assert torch.isfinite(found.scale).all()
+        if solver is solve_camera:
+            (found.R[:, 0].sum() + found.scale.sum()).backward()
+            assert torch.isfinite(shape.grad).all()
 
 
 def test_an_unknown_solver_is_refused():

@@ -17,7 +17,7 @@ from training import starting, trainer
 from training.encoder_fit import fit_encoder
 from training.recipe import Recipe, RecipeError
 from training.reconstruction import final_loss
-from training.trainer import Trainer, TrainingError, rule_share
+from training.trainer import Trainer, TrainingError, one_buffer, rule_share
 
 COCO = load_layout("coco17")
 TINY = {
@@ -298,3 +298,33 @@ def test_the_papers_recipe_is_the_papers():
     assert (paper.code_weight, paper.decay_weight, paper.solver, paper.start) == (0.01, 1e-4, "algebraic", "random")
     beyond = (paper.handedness_weight, paper.bone_weight, paper.nuclear_weight, paper.hide, paper.roll)
     assert not any(beyond) and not paper.mirror_view and not paper.mirror_object
+
+
+# --- one buffer for all weights
+
+
+def test_adam_on_one_buffer_is_adam_on_each_parameter():
+    torch.manual_seed(0)
+    layers = [torch.nn.Linear(5, 7) for _ in range(2)]
+    layers[1].load_state_dict(layers[0].state_dict())
+    trained = [one_buffer(list(layers[0].parameters()))], list(layers[1].parameters())
+    optimizers = [torch.optim.Adam(parameters, lr=0.1) for parameters in trained]
+    for x in torch.randn(4, 9, 5):
+        for layer, parameters, optimizer in zip(layers, trained, optimizers):
+            optimizer.zero_grad(set_to_none=False)
+            layer(x).square().mean().backward()
+            torch.nn.utils.clip_grad_norm_(parameters, 0.1)
+            optimizer.step()
+    for a, b in zip(*(layer.parameters() for layer in layers)):
+        torch.testing.assert_close(a, b)
+
+
+def test_a_continued_run_still_trains_the_weights_of_its_networks(tmp_path):
+    data, _, _ = sequence()
+    recipe = Recipe.from_dict({**FREE, "steps": 4})
+    until(Trainer(data, recipe, tmp_path), 2)
+    again = Trainer(data, recipe, tmp_path)
+    assert again.resume()
+    before = [weight.clone() for weight in again.networks.decoder.parameters()]
+    through(again)
+    assert all(not torch.equal(a, b) for a, b in zip(before, again.networks.decoder.parameters()))

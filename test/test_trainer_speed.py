@@ -46,6 +46,7 @@ def test_rows_and_table(speed, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["trainer_speed.py", "--rounds", "1", "--json", str(tmp_path / "s.json")])
     speed.main()
     rows = json.loads((tmp_path / "s.json").read_text())["rows"]
-    assert [(row["mode"], row["batch"]) for row in rows] == [(mode, n) for mode in speed.MODES for n in (128, 256)]
+    cases = [(mode, solver, n) for mode in speed.MODES for solver in speed.SOLVERS for n in (128, 256)]
+    assert [(row["mode"], row["solver"], row["batch"]) for row in rows] == cases
     assert all(row["frames_per_second"] > 0 < row["speed_ratio"] for row in rows)
-    assert capsys.readouterr().out.count("\n") == 6
+    assert capsys.readouterr().out.count("\n") == 10

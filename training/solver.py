@@ -27,7 +27,7 @@ from paul_ros import viewing_sphere
 Scale = viewing_sphere.Scale
 
 _RIDGE = 1e-4  # of the shape's squared size: keeps flat shapes solvable
-_FLAT = 1e-9  # of the squared size's square: an optimum on a flatter hill is moved as if it were as steep
+_FLAT = 1e-9  # of the moments: an optimum on a flatter hill is moved as if it were as steep
 _TINY = 1e-30
 
 
@@ -146,7 +146,7 @@ class _Optimum(torch.autograd.Function):
             moments[~finite] = 0.0  # a training that diverged: its loss will tell
         poses = viewing_sphere.solve(moments, np.zeros(moments.shape[:2]), scale, rivals=False)
         ctx.save_for_backward(X)
-        ctx.optimum = moments, poses.R[:, 0], poses.scale[:, 0], scale
+        ctx.optimum = moments, poses.R[:, 0], poses.scale[:, 0], poses.determined, scale
         return torch.from_numpy(poses.R[:, 0]).to(S), torch.from_numpy(poses.scale[:, 0]).to(S)
 
     @staticmethod
@@ -159,9 +159,18 @@ class _Optimum(torch.autograd.Function):
 
 
 def _slope_in_moments(
-    moments: np.ndarray, R: np.ndarray, s: np.ndarray, scale: Scale, in_R: np.ndarray, in_s: np.ndarray
+    moments: np.ndarray,
+    R: np.ndarray,
+    s: np.ndarray,
+    determined: np.ndarray,
+    scale: Scale,
+    in_R: np.ndarray,
+    in_s: np.ndarray,
 ) -> np.ndarray:
-    """A loss's gradient in moments (N,5,5), summed with its transpose, from that in R (N,3,3) and s (N,)."""
+    """A loss's gradient in moments (N,5,5), summed with its transpose, from that in R (N,3,3) and s (N,).
+
+    It is 0 where no pose is determined.
+    """
     M = s[:, None, None] * R
     along = M.transpose(0, 2, 1)
     A, B = M @ moments[:, :3, :3] @ along, moments[:, 3:, :3] @ along
@@ -170,15 +179,16 @@ def _slope_in_moments(
     g_size = in_s * s
     p, q, r = (A[:, i, j] - B[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     ax, ay, across = A[:, 0, 2], A[:, 1, 2], A[:, 0, 0] + A[:, 1, 1]
-    over_roll = 1 / np.maximum(across - p - r, _TINY)
-    over_size = (scale == "free") / np.maximum(across, _TINY)
+    least = _FLAT * (across + A[:, 2, 2] + abs(p) + abs(r)) + _TINY
+    over_roll = 1 / np.maximum(across - p - r, least)
+    over_size = (scale == "free") / np.maximum(across, least)
     # Tilts (x, y) that remain once the roll z and the size have followed.
     gx = gx + over_roll * ax * gz + over_size * ay * g_size
     gy = gy + over_roll * ay * gz - over_size * ax * g_size
     xx = A[:, 2, 2] - r - over_roll * ax * ax - over_size * ay * ay
     yy = A[:, 2, 2] - p - over_roll * ay * ay - over_size * ax * ax
     xy = q + (over_size - over_roll) * ax * ay
-    over = 1 / np.maximum(xx * yy - xy * xy, _FLAT * across * across + _TINY)
+    over = 1 / np.maximum(xx * yy - xy * xy, least * least / _FLAT)
     ux, uy = over * (yy * gx - xy * gy), over * (xx * gy - xy * gx)
     uz = over_roll * (gz + ax * ux + ay * uy)
     size = over_size * (g_size + ay * ux - ax * uy)
@@ -187,7 +197,7 @@ def _slope_in_moments(
     found = np.zeros_like(moments)
     found[:, :3, :3] = in_A + in_A.transpose(0, 2, 1)
     found[:, 3:, :3], found[:, :3, 3:] = U, U.transpose(0, 2, 1)
-    return found
+    return found * determined[:, None, None]
 
 
 def _trace(M: Tensor) -> Tensor:
