@@ -253,8 +253,9 @@ class _OwnMoments(Moments):
         found = []
         for one in R:
             H, h, rest = self._system(self._gram_of_one(one), one.expand(len(self.seen), 3, 3), sigma)
-            inverse, log_det = _inverse(H)
-            found.append(self._nll(log_det, rest - (h[:, None] @ inverse @ h[..., None]).flatten(), sigma))
+            L = torch.linalg.cholesky(H)
+            explained = torch.linalg.solve_triangular(L, h[..., None], upper=False).square().sum((1, 2))
+            found.append(self._nll(_log_det(L), rest - explained, sigma))
         return torch.stack(found)
 
     def spread(self, posterior: Posterior) -> Tensor:
