@@ -18,10 +18,6 @@ _FREE_CODE_SIZE = 0.1
 """Standard deviation of free codes at the start: a tenth or ten times of it trained worse."""
 
 
-_AXIS_VIEWS = 1000
-"""Views that the main axis is found from."""
-
-
 class _Layers(torch.autograd.Function):
     """Linear layers with an ELU between any two: x (N,inputs) and each layer's weight and bias to (N,outputs).
 
@@ -69,46 +65,26 @@ class ResidualBlock(nn.Module):
         return x + self.second(self.first(x).relu_()).relu_()
 
 
-class Encoder(nn.Module):
-    """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K).
-
-    Args:
-        axis: (P,) weights of the points whose weighted sum every view is turned by, to point up; None: views as they
-            are. An orthographic camera that rolls sees the same shape, which so need not be learned for every roll.
-    """
-
-    def __init__(self, axis: Tensor | None) -> None:
-        super().__init__()
-        self.register_buffer("axis", axis)
-
-    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
-        return self.code(W if self.axis is None else upright(W, self.axis), visible)
-
-    def code(self, W: Tensor, visible: Tensor) -> Tensor:
-        """h of views that are turned already."""
-        raise NotImplementedError
-
-
-class ResidualEncoder(Encoder):
+class ResidualEncoder(nn.Module):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by residual blocks.
 
     Martinez et al. have 2 blocks; 6 of width 1024 are the depth of C3DPO (Novotny et al., ICCV 2019).
     """
 
-    def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axis: Tensor | None = None) -> None:
-        super().__init__(axis)
+    def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
+        super().__init__()
         self.input = nn.Linear(3 * points, width)
         self.blocks = nn.ModuleList(ResidualBlock(width) for _ in range(blocks))
         self.output = nn.Linear(width, bottleneck)
 
-    def code(self, W: Tensor, visible: Tensor) -> Tensor:
+    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
         x = self.input(torch.cat([W.flatten(1), visible.to(W.dtype)], dim=1)).relu_()
         for block in self.blocks:
             x = block(x)
         return self.output(x)
 
 
-class ConvolutionalEncoder(Encoder):
+class ConvolutionalEncoder(nn.Module):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by block-sparse coding.
 
     The encoder of Deep NRSfM (Kong and Lucey, ICCV 2019).  An orthographic view of S = sum_k c_k D_k by a camera R is
@@ -125,8 +101,8 @@ class ConvolutionalEncoder(Encoder):
     is solved for), and the last layer is also told which points are visible.
     """
 
-    def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axis: Tensor | None = None) -> None:
-        super().__init__(axis)
+    def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
+        super().__init__()
         atoms = dictionary_sizes(width, blocks, bottleneck)
         sizes = [(3 * atoms[0], points), *zip(atoms[1:], atoms)]
         self.dictionaries = nn.ParameterList(torch.empty(size) for size in sizes)
@@ -135,7 +111,7 @@ class ConvolutionalEncoder(Encoder):
             nn.init.kaiming_normal_(dictionary)
         self.output = nn.Linear(6 * atoms[-1] + points, bottleneck)
 
-    def code(self, W: Tensor, visible: Tensor) -> Tensor:
+    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
         first, *others = self.dictionaries
         x = (W @ first.T).reshape(len(W), 6, -1)
         x = F.relu(x - self.thresholds[0])
@@ -200,15 +176,14 @@ class Paul(nn.Module):
         return self.encoder(W, visible) if self.free_codes is None else self.free_codes(rows)
 
 
-def build_networks(layout: Layout, recipe: Recipe, frames: int, axis: Tensor | None = None) -> Paul:
+def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
     """The recipe's networks for a layout, with fresh weights from torch's default generator.
 
     Args:
         frames: number of training frames, for free codes.
-        axis: (P,) of ``Encoder``.
     """
     points, K = len(layout.names), recipe.bottleneck
-    encoder = ENCODERS[recipe.encoder](points, K, recipe.width, recipe.blocks, axis)
+    encoder = ENCODERS[recipe.encoder](points, K, recipe.width, recipe.blocks)
     decoder = ShapeDecoder(layout, K, recipe.hidden, unit_size=recipe.scale == "free")
     shape_encoder = ShapeEncoder(points, K, recipe.hidden)
     free_codes = None
@@ -216,19 +191,6 @@ def build_networks(layout: Layout, recipe: Recipe, frames: int, axis: Tensor | N
         free_codes = nn.Embedding(frames, K)
         nn.init.normal_(free_codes.weight, std=_FREE_CODE_SIZE)
     return Paul(encoder, decoder, shape_encoder, free_codes)
-
-
-def main_axis(W: Tensor) -> Tensor:
-    """(P,) unit weights of the points whose sum over views (F,2,P) is longest: the first principal direction."""
-    some = W[torch.linspace(0, len(W) - 1, min(len(W), _AXIS_VIEWS)).long()]
-    return torch.linalg.svd(some.flatten(0, 1).double(), full_matrices=False).Vh[0].to(W)
-
-
-def upright(W: Tensor, axis: Tensor) -> Tensor:
-    """Views (N,2,P) turned so that the sum of their points, weighted by ``axis`` (P,), points along the second axis."""
-    x, y = torch.nn.functional.normalize(W @ axis, dim=1).unbind(1)
-    turn = torch.stack([torch.stack([y, -x], 1), torch.stack([x, y], 1)], 1)
-    return turn @ W
 
 
 def to_centre(S: Tensor, layout: Layout) -> Tensor:

@@ -27,7 +27,7 @@ from paul_ros.skeleton import Layout
 from training import starting
 from training.data import TrainingData
 from training.distributed import Share, from_first, is_first, processes, share_of
-from training.networks import Paul, build_networks, main_axis
+from training.networks import Paul, build_networks
 from training.objective import Terms, Views, paul_terms, regression_terms
 from training.recipe import Recipe
 from training.starting import START_UNIT, Lesson, Progress, Start, StartError, kept_start
@@ -99,13 +99,10 @@ class Trainer:
         self.data, self.recipe, self.folder, self.device = data, recipe, folder, torch.device(device)
         if processes() > len(data.W) or 0 < recipe.batch < processes():
             raise TrainingError(f"{processes()} processes cannot share a batch of fewer frames: start fewer")
-        self._W = torch.from_numpy(data.W).to(self.device)
-        self._visible = torch.from_numpy(data.visible).to(self.device)
-        self._mirror = torch.tensor(data.layout.mirror, device=self.device)
         self.generator = torch.Generator().manual_seed(recipe.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.seed)
-            self.networks = build_networks(data.layout, recipe, len(data.W), self._axis()).to(self.device)
+            self.networks = build_networks(data.layout, recipe, len(data.W)).to(self.device)
         self.optimizer = self._optimizer()
         self._objective: nn.Module = _Objective(self.networks, data.layout, recipe)
         if processes() > 1:
@@ -114,10 +111,9 @@ class Trainer:
         self.step, self.seconds, self.rows = 0, 0.0, []
         self.stopped = False
         self._window = [0, 0.0, math.inf]  # steps and losses since the last look at them, and the mean before it
-
-    def _axis(self) -> Tensor | None:
-        """What h turns views by, if the recipe asks for it."""
-        return main_axis(self.views(torch.arange(len(self.data.W))).W) if self.recipe.upright else None
+        self._W = torch.from_numpy(data.W).to(self.device)
+        self._visible = torch.from_numpy(data.visible).to(self.device)
+        self._mirror = torch.tensor(data.layout.mirror, device=self.device)
 
     @property
     def checkpoint(self) -> Path:
