@@ -15,12 +15,15 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from paul_ros import viewing_sphere
+
+Array = TypeVar("Array", np.ndarray, Tensor)
 
 _RIDGE = 1e-9
 _REFINEMENTS = 6
@@ -57,6 +60,10 @@ class Observations:
     def points(self) -> int:
         """P."""
         return self.W.shape[2]
+
+    def completed(self, S: Tensor) -> Tensor:
+        """Shapes (F,3,P) in camera frame with x and y of the visible points as they were observed."""
+        return torch.cat([torch.where(self.visible[:, None], self.W, S[:, :2]), S[:, 2:]], 1)
 
     @cached_property
     def complete(self) -> bool:
@@ -312,6 +319,10 @@ class LinearModel:
         """Expected shapes (F,3,P), canonical frame."""
         return torch.tensordot(with_one(posterior.mean), self.V, 1)
 
+    def in_camera(self, seen: Observations, sigma: float) -> Tensor:
+        """Expected shapes (F,3,P) in camera frame, centred on the visible points."""
+        return centred_on_visible(self.R @ self.shapes(self.posterior(seen, sigma)), seen.visible)
+
     def em_step(self, seen: Observations, sigma: float, penalty: float) -> LinearModel:
         """One step of expectation maximisation: bases, cameras, and codes made white again."""
         posterior = self.posterior(seen, sigma)
@@ -363,6 +374,12 @@ class LinearModel:
         """Mean negative log likelihood of a frame, plus the penalty on the size of the bases."""
         nll = Moments.of(seen, self.V).marginal_nll(self.R, sigma).mean()
         return float(nll + penalty * self.V.square().sum() / (3 * seen.points))
+
+
+def centred_on_visible(S: Array, visible: Array) -> Array:
+    """Shapes (F,3,P), tensor or array, about the means of their visible (F,P) points."""
+    shown = visible[:, None]
+    return S - (S * shown).sum(2, keepdims=True) / shown.sum(2, keepdims=True)
 
 
 def random_rotations(count: int, generator: np.random.Generator) -> Tensor:

@@ -7,7 +7,8 @@ A linear model with much noise has few minima; the noise is then lowered step by
 1. Basin: many random starts on few frames, halved by likelihood on the way; the best few different ones go on to all
    frames, and the most likely of them is taken. Random shapes, not rigid ones: the rigid factorisation of lowest
    residual can lie in a wrong basin.
-2. Detail: many bases and ever less noise. How little is right differs from data to data, and neither the likelihood nor
+2. One mirror image for all frames, where many viewpoints have mixed them (``synchronise.py``).
+3. Detail: many bases and ever less noise. How little is right differs from data to data, and neither the likelihood nor
    points held out tell. Two models of one half of the frames each do, by how far they differ about the depth of all
    frames; the answer is the mean of both, over all levels of noise that are nearly as good as the best.
 """
@@ -16,20 +17,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from training.linear_model import LinearModel, Moments, Observations, random_rotations
+from training.linear_model import LinearModel, Moments, Observations, centred_on_visible, random_rotations
 from training.starting import Progress, StartError
-
-Array = TypeVar("Array", np.ndarray, Tensor)
+from training.synchronise import synchronised
 
 _STARTS = 48
 _START_FRAMES = 300
-_MAX_FRAMES = 1500
+_MAX_FRAMES = 1200
 _MAX_POINTS = 256
 _MIN_VISIBLE = 3
 _CANDIDATES = 4
@@ -75,7 +75,7 @@ def _breakdown_explained() -> Iterator[None]:
 
 @_breakdown_explained()
 def linear_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progress | None = None) -> Start:
-    """Shapes of up to 1500 frames by the linear model.
+    """Shapes of up to 1200 frames by the linear model.
 
     Args:
         W: (F,2,P) image points of one scale, root mean square coordinate 1; anything where hidden.
@@ -96,9 +96,10 @@ def linear_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progre
         )
     rows = usable[_chosen(len(usable), _MAX_FRAMES, generator)]
     seen = Observations.of(W[np.ix_(rows, [0, 1], points)], visible[np.ix_(rows, points)])
-    basin = find_basin(seen, generator, lambda done: tell(0.5 * done))
+    basin = find_basin(seen, generator, lambda done: tell(0.4 * done))
+    basin = synchronised(basin, seen, generator, lambda done: tell(0.4 + 0.3 * done))
     score = basin.objective(seen, _CANDIDATE[-1][0], 0.0)
-    shapes, rotations = find_detail(basin, seen, generator, lambda done: tell(0.5 + 0.5 * done))
+    shapes, rotations = find_detail(basin, seen, generator, lambda done: tell(0.7 + 0.3 * done))
     if len(points) < W.shape[2]:
         shapes = _extended(shapes, rotations, W[rows], visible[rows], points)
     tell(1.0)
@@ -117,7 +118,7 @@ def rigid_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progres
         models.append(model.polished(seen, 0.3, 0.0, 100))
         tell((number + 1) / _CANDIDATES)
     best = min(models, key=lambda model: model.objective(seen, 0.3, 0.0))
-    shapes = _centred(best.V.expand(len(seen), -1, -1), seen.visible).numpy()
+    shapes = centred_on_visible(best.V.expand(len(seen), -1, -1), seen.visible).numpy()
     return Start(np.arange(len(seen)), shapes, best.R.numpy(), best.objective(seen, 0.3, 0.0))
 
 
@@ -152,8 +153,8 @@ def find_detail(
     found = []
     for number, (sigma, iterations) in enumerate(_DETAIL):
         models = [_fitted_to(half, model, seen, sigma, iterations) for half, model in zip(halves, models)]
-        views = [_as_seen(model, seen, sigma) for model in models]
-        found.append((_doubt(views, seen), sum(_observed(view, seen) for view in views) / len(views), models[0].R))
+        views = [model.in_camera(seen, sigma) for model in models]
+        found.append((_doubt(views, seen), sum(seen.completed(view) for view in views) / len(views), models[0].R))
         progress((number + 1) / len(_DETAIL))
     least, _, R = min(found, key=lambda one: one[0])
     good = [shapes for doubt, shapes, _ in found if doubt <= _DOUBT_MARGIN * least]
@@ -209,29 +210,13 @@ def _fitted_to(half: np.ndarray, model: LinearModel, seen: Observations, sigma: 
     return LinearModel(fitted.V, R)
 
 
-def _as_seen(model: LinearModel, seen: Observations, sigma: float) -> Tensor:
-    """Expected shapes (F,3,P) in camera frame, centred on the visible points."""
-    return _centred(model.R @ model.shapes(model.posterior(seen, sigma)), seen.visible)
-
-
-def _centred(S: Array, visible: Array) -> Array:
-    """Shapes (F,3,P), tensor or array, about the means of their visible (F,P) points."""
-    shown = visible[:, None]
-    return S - (S * shown).sum(2, keepdims=True) / shown.sum(2, keepdims=True)
-
-
-def _observed(view: Tensor, seen: Observations) -> Tensor:
-    """Shapes (F,3,P) in camera frame with x and y of the visible points as they were observed."""
-    return torch.cat([torch.where(seen.visible[:, None], seen.W, view[:, :2]), view[:, 2:]], 1)
-
-
 def _doubt(views: list[Tensor], seen: Observations) -> float:
     """Guess of the error of depth: how far two models differ, and how far they smooth what was observed.
 
     Too little noise lets each follow its own frames, too much rounds both off alike; the image shows that per axis.
     """
-    apart = (_observed(views[0], seen) - _observed(views[1], seen)).flatten(1).norm(dim=1).mean()
-    off = sum((_observed(view, seen) - view).flatten(1).norm(dim=1).mean() for view in views) / len(views)
+    apart = (seen.completed(views[0]) - seen.completed(views[1])).flatten(1).norm(dim=1).mean()
+    off = sum((seen.completed(view) - view).flatten(1).norm(dim=1).mean() for view in views) / len(views)
     return float(torch.hypot(apart, off / 2**0.5))
 
 
@@ -260,7 +245,7 @@ def _extended(
         left = (mask.T @ products).reshape(-1, size, size) + _EXTENSION_RIDGE * np.eye(size)
         right = D.reshape(2 * frames, size).T @ image.reshape(2 * frames, -1)
         V[block] = np.linalg.solve(left, right.T[..., None])[..., 0]
-    return _centred(np.einsum("fk,pki->fip", codes, V.reshape(total, -1, 3), optimize=True), visible)
+    return centred_on_visible(np.einsum("fk,pki->fip", codes, V.reshape(total, -1, 3), optimize=True), visible)
 
 
 def _codes(shapes: np.ndarray) -> np.ndarray:

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One mirror image for all frames: which of its two each frame of many viewpoints shows, from 2D alone.
+
+An orthographic view fits a shape and its mirror image alike. Where cameras and poses vary much, a reconstruction is
+right up to its mirror image within each region of pose space, and regions disagree. Two frames of alike poses tell
+whether they agree: one is nearer to the other or to the other's mirror image. So frames are clustered by likeness up to
+mirroring, signs made equal within each cluster, and whole clusters flipped wherever a linear model then explains the
+views better.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from training.linear_model import LinearModel, Observations
+from training.starting import Progress
+
+_AGREEING = 0.975  # of nearest neighbours: 1.00 on sequences of one camera path, 0.99 at the truth of random cameras
+_FLAT = 1e-4
+_TINY = 1e-100  # its cube is a number still
+_ROUNDS = (24, 24, 48)  # clusters
+_LEAST_CLUSTER = 8  # frames, on average
+_NEIGHBOURS = 10
+_BASES = 12
+_REFIT = ((0.1, 40), (0.05, 40))  # sigma and L-BFGS iterations
+_REBUILT = ((0.05, 40), (0.03, 40))
+_MEAN_ROUNDS = 10
+
+
+def mirrored(X: Tensor) -> Tensor:
+    """The other shapes (F,3,P) with the same views: depths reversed."""
+    return X * X.new_tensor([1.0, 1.0, -1.0])[:, None]
+
+
+def likeness(X: Tensor, Y: Tensor) -> tuple[Tensor, Tensor]:
+    """How alike shapes (M,3,P) and (N,3,P) are under the best rotation: (M,N) up to mirroring, and (M,N) sign.
+
+    Shapes are centred on all their points. With singular values a >= b >= c of X Y^T, divided by the norms of X and Y,
+    the best rotation correlates them by a + b +- c, + where the determinant is positive; their mirror images by
+    a + b -+ c. Returned are a + b + c, 1 for one shape or its mirror image, and +- c, positive where both are the same.
+    """
+    X, Y = (S / S.flatten(1).norm(dim=1).clamp_min(_TINY)[:, None, None] for S in (X, Y))
+    M = torch.einsum("mip,njp->mnij", X, Y)
+    squares = _eigenvalues(M.transpose(2, 3) @ M).clamp_min(0).sqrt()
+    return squares.sum(2), torch.linalg.det(M).sign() * squares[..., 2]
+
+
+def _eigenvalues(A: Tensor) -> Tensor:
+    """Eigenvalues (...,3) of symmetric 3x3 matrices, falling, in closed form (Smith, 1961)."""
+    middle = A.diagonal(dim1=-2, dim2=-1).mean(-1)
+    B = A - middle[..., None, None] * torch.eye(3, dtype=A.dtype)
+    spread = (B.square().sum((-2, -1)) / 6).sqrt().clamp_min(_TINY)
+    angle = (torch.linalg.det(B) / (2 * spread**3)).clamp(-1, 1).acos() / 3
+    turns = torch.tensor([0.0, -2 * math.pi / 3, 2 * math.pi / 3], dtype=A.dtype)
+    return (middle[..., None] + 2 * spread[..., None] * (angle[..., None] + turns).cos()).sort(-1, True).values
+
+
+def aligned(X: Tensor) -> tuple[Tensor, Tensor]:
+    """Generalised Procrustes: shapes (F,3,P) turned onto their common mean, and the rotations (F,3,3) that do it."""
+    mean = X[0]
+    for _ in range(_MEAN_ROUNDS):
+        R = _onto(X, mean)
+        mean = (R @ X).mean(0)
+    R = _onto(X, mean)
+    return R @ X, R
+
+
+def _onto(X: Tensor, mean: Tensor) -> Tensor:
+    """Rotations (F,3,3) that turn shapes (F,3,P) onto one (3,P) (Kabsch)."""
+    U, _, V = torch.linalg.svd(mean @ X.transpose(1, 2))
+    sign = torch.linalg.det(U @ V)
+    U = torch.cat([U[:, :, :2], U[:, :, 2:] * sign[:, None, None]], 2)
+    return U @ V
+
+
+def fitted(X: Tensor, seen: Observations, bases: int, stages: tuple) -> LinearModel:
+    """The linear model of shapes (F,3,P) in camera frame, polished on what was seen; stages of sigma and iterations."""
+    canonical, A = aligned(X)
+    mean = canonical.mean(0)
+    _, size, V = torch.linalg.svd((canonical - mean).flatten(1), full_matrices=False)
+    V = (V[:bases] * size[:bases, None] / len(X) ** 0.5).unflatten(1, (3, -1))
+    model = LinearModel(torch.cat([mean[None], V]), A.transpose(1, 2))
+    for sigma, iterations in stages:
+        model = model.polished(seen, sigma, 0.0, iterations)
+    return model
+
+
+def agreeing_share(X: Tensor) -> float:
+    """How far nearest neighbours of shapes (F,3,P) show the same mirror image: 0 to 1, flat shapes hardly counting."""
+    close, sign = likeness(X, X)
+    nearest = close.fill_diagonal_(-1.0).topk(min(3, len(X) - 1), dim=1).indices
+    sign = torch.gather(sign, 1, nearest)
+    total = sign.abs().sum()
+    return float(sign.clamp_min(0).sum() / total) if total > _FLAT * sign.numel() else 1.0
+
+
+def synchronised(
+    model: LinearModel, seen: Observations, generator: np.random.Generator, progress: Progress
+) -> LinearModel:
+    """A model whose frames show one mirror image; the one that is given, where they do.
+
+    Of few frames or wild poses neighbours tell little even at the truth: a round that makes the views less likely is
+    taken back.
+    """
+    X = _shapes(model, seen)
+    if agreeing_share(X) >= _AGREEING:
+        return model
+    bases, (sigma, _) = len(model.V) - 1, _REBUILT[-1]
+    few = min(_BASES, bases)
+    least = _settled(model, seen).objective(seen, sigma, 0.0)
+    for number, clusters in enumerate(_ROUNDS):
+        done = number / len(_ROUNDS)
+        better = flipped(X, seen, few, clusters, generator, lambda share: progress(done + share / len(_ROUNDS)))
+        other = _rebuilt(better, seen, few, bases, generator)
+        if (found := other.objective(seen, sigma, 0.0)) >= least:
+            continue
+        model, least, X = other, found, _shapes(other, seen)
+        if agreeing_share(X) >= _AGREEING:
+            break
+    return model
+
+
+def _rebuilt(X: Tensor, seen: Observations, few: int, bases: int, generator: np.random.Generator) -> LinearModel:
+    """The model of shapes (F,3,P) in camera frame: of few bases first, for its cameras to be searched for by them."""
+    model = fitted(X, seen, few, _REFIT).searched(seen, _REFIT[-1][0], generator).widened(bases, generator)
+    return _settled(model, seen)
+
+
+def _settled(model: LinearModel, seen: Observations) -> LinearModel:
+    for sigma, iterations in _REBUILT:
+        model = model.polished(seen, sigma, 0.0, iterations)
+    return model
+
+
+def _shapes(model: LinearModel, seen: Observations) -> Tensor:
+    """Shapes (F,3,P) in camera frame as observed, centred on all points: on the visible ones no two would compare."""
+    X = seen.completed(model.in_camera(seen, _REBUILT[-1][0]))
+    return X - X.mean(2, keepdim=True)
+
+
+def flipped(
+    X: Tensor, seen: Observations, bases: int, clusters: int, generator: np.random.Generator, progress: Progress
+) -> Tensor:
+    """Shapes (F,3,P) in camera frame, clusters of them mirrored wherever that makes the views more likely.
+
+    Args:
+        bases: of the linear model that tells.
+        clusters: at most so many.
+    """
+    clusters = min(clusters, max(2, len(X) // _LEAST_CLUSTER))
+    close, sign = likeness(X, X)
+    labels = _clusters(close, clusters, generator)
+    X = _agreeing(X, close, sign, labels)
+
+    def cost(X: Tensor) -> float:
+        return fitted(X, seen, bases, _REFIT).objective(seen, _REFIT[-1][0], 0.0)
+
+    least = cost(X)
+    present = labels.unique().numpy()
+    for number, cluster in enumerate(generator.permutation(present)):
+        other = torch.where((labels == cluster)[:, None, None], mirrored(X), X)
+        if (found := cost(other)) < least:
+            X, least = other, found
+        progress((number + 1) / len(present))
+    return X
+
+
+def _clusters(close: Tensor, count: int, generator: np.random.Generator) -> Tensor:
+    """Numbers (F,) of clusters by likeness (F,F): spectral embedding of the nearest neighbours, then k-means."""
+    frames = len(close)
+    near = close.topk(min(_NEIGHBOURS + 1, frames), dim=1)
+    distance = (1 - near.values).clamp_min(0)  # of points on one line rounding makes it negative
+    scale = distance[:, -1].median().clamp_min(1e-12)
+    W = torch.zeros_like(close).scatter_(1, near.indices, (-distance / scale).exp())
+    W = W + W.T
+    root = W.sum(1).rsqrt()
+    _, vectors = torch.linalg.eigh(root[:, None] * W * root)
+    embedding = torch.nn.functional.normalize(vectors[:, -count:], dim=1)
+    return _k_means(embedding, count, generator)
+
+
+def _k_means(points: Tensor, count: int, generator: np.random.Generator) -> Tensor:
+    centres = points[_spread_out(points, count, generator)]
+    for _ in range(50):
+        labels = torch.cdist(points, centres).argmin(1)
+        member = torch.nn.functional.one_hot(labels, count).to(points)
+        centres = member.T @ points / member.sum(0)[:, None].clamp_min(1)
+    return labels
+
+
+def _spread_out(points: Tensor, count: int, generator: np.random.Generator) -> list[int]:
+    """Starts of k-means: each the farthest from those before."""
+    chosen = [int(generator.integers(len(points)))]
+    distance = (points - points[chosen[0]]).norm(dim=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (points - points[chosen[-1]]).norm(dim=1))
+    return chosen
+
+
+def _agreeing(X: Tensor, close: Tensor, sign: Tensor, labels: Tensor) -> Tensor:
+    """Shapes of one mirror image within each cluster: by the leading eigenvector of their weighted agreements."""
+    X = X.clone()
+    for cluster in range(int(labels.max()) + 1):
+        rows = (labels == cluster).nonzero()[:, 0]
+        if len(rows) < 2:
+            continue
+        _, vectors = torch.linalg.eigh(sign[rows][:, rows] * close[rows][:, rows] ** 8)
+        wrong = rows[vectors[:, -1] * vectors[:, -1].sum() < 0]
+        X[wrong] = mirrored(X[wrong])
+    return X
