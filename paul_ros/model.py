@@ -89,7 +89,10 @@ class Model:
         forward = (
             self._convolutional if self.header["architecture"]["encoder"]["kind"] == CONVOLUTIONAL else self._residual
         )
-        return forward(self.normalise(W, visible).astype(np.float32), np.asarray(visible, np.float32))
+        W = self.normalise(W, visible).astype(np.float32)
+        if is_upright(self.header):
+            W = upright(W, self.weights["encoder.axes"])
+        return forward(W, np.asarray(visible, np.float32))
 
     def _residual(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """The twin of ``training.networks.ResidualEncoder``."""
@@ -164,6 +167,24 @@ def normalise(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
     W = centre(W, visible)
     size = np.sqrt((W**2).sum((1, 2), keepdims=True) / count)
     return W / np.where(size > 0, size, 1.0)
+
+
+def is_upright(header: dict) -> bool:
+    """Whether h sees views brought upright; older models say nothing of it, and theirs does not."""
+    return header["architecture"]["encoder"].get("upright", False)
+
+
+def upright(W: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Image points (N,2,P) turned and mirrored to one side, which to an orthographic camera changes no shape.
+
+    An image turned is one of a camera that rolled, an image mirrored one from behind: h need not learn either. The sum
+    of the points weighted by the first of ``axes`` (2,P) comes to point along y, by the second to have a positive x.
+    """
+    direction = W @ axes[0]
+    x, y = (direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)).T
+    turned = np.stack([np.stack([y, -x], 1), np.stack([x, y], 1)], 1) @ W
+    turned[turned[:, 0] @ axes[1] < 0, 0] *= -1
+    return turned
 
 
 def to_centre(S: np.ndarray, layout: Layout) -> np.ndarray:
@@ -272,6 +293,8 @@ def weight_shapes(header: dict, points: int) -> dict[str, tuple[int, ...]]:
     """Shapes of all arrays that a model with this header and P points must hold."""
     encoder, K = header["architecture"]["encoder"], header["bottleneck"]
     shapes: dict[str, tuple[int, ...]] = {"mean_shape": (3, points)}
+    if is_upright(header):
+        shapes["encoder.axes"] = (2, points)
     layers = {}
     if encoder["kind"] == CONVOLUTIONAL:
         atoms = dictionary_sizes(encoder["width"], encoder["blocks"], K)
@@ -331,6 +354,8 @@ def _check_architecture(header: dict) -> None:
     sizes = [header["bottleneck"], encoder["width"], *decoder["hidden"]]
     if not all(type(size) is int and 0 < size <= _MAX_WIDTH for size in [*sizes, encoder["blocks"]]):
         raise ValueError(f"layer sizes must be whole numbers from 1 to {_MAX_WIDTH}")
+    if type(is_upright(header)) is not bool:
+        raise ValueError(f"upright is {is_upright(header)!r}, neither true nor false")
     if len(sizes) > _MAX_LAYERS or encoder["blocks"] > _MAX_LAYERS:
         raise ValueError(f"more than {_MAX_LAYERS} layers")
 

@@ -37,9 +37,9 @@ def trained(data, folder, **settings):
 
 
 @pytest.mark.parametrize("scale", ["free", "unit"])
-@pytest.mark.parametrize("encoder", ["residual", "convolutional"])
-def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, encoder):
-    trainer = trained(data, tmp_path, scale=scale, encoder=encoder)
+@pytest.mark.parametrize("encoder, upright", [("residual", False), ("residual", True), ("convolutional", False)])
+def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, encoder, upright):
+    trainer = trained(data, tmp_path, scale=scale, encoder=encoder, upright=upright)
     header = export_model(trainer, tmp_path / "m.npz", "paul train")
     model = load_model(tmp_path / "m.npz")
     assert model.scale == scale and ("image_unit" in header) == (scale == "unit")
@@ -49,6 +49,8 @@ def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, enco
     with torch.no_grad():
         S = trainer.networks.decoder(trainer.networks.encoder(views.W, views.visible)).numpy()
     np.testing.assert_allclose(model.shape(data.W, data.visible), S, atol=1e-4)
+    turned = np.array([[0, -1], [1, 0]]) @ data.W
+    assert np.allclose(model.shape(turned, data.visible), S, atol=1e-4) == upright
     sizes = np.linalg.norm(model.shape(data.W, data.visible), axis=(1, 2))
     assert (np.ptp(sizes) > 1e-3) == (scale == "unit")
 

@@ -157,6 +157,53 @@ def test_old_models_say_nothing_of_scale_and_are_free(saved):
     assert load_model(saved).scale == "free" == load_model().scale
 
 
+def upright_header(value=True):
+    base = header()
+    base["architecture"]["encoder"]["upright"] = value
+    return base
+
+
+def upright_arrays(axes):
+    return {**arrays(), "encoder.axes": axes}
+
+
+def test_models_of_upright_views_round_trip(tmp_path):
+    axes = np.random.default_rng(5).standard_normal((2, 17)).astype(np.float32)
+    save_model(tmp_path / "m.npz", upright_header(), upright_arrays(axes))
+    model = load_model(tmp_path / "m.npz")
+    np.testing.assert_array_equal(model.weights["encoder.axes"], axes)
+    W, visible = np.random.default_rng(1).standard_normal((4, 2, 17)), np.ones((4, 17), bool)
+    turned = np.array([[0.0, 1.0], [1.0, 0.0]]) @ W  # x and y exchanged: a turn and a mirror
+    np.testing.assert_allclose(model.encode(turned, visible), model.encode(W, visible), atol=1e-5)
+
+
+def test_old_models_say_nothing_of_upright_and_see_views_as_they_are(tmp_path, saved):
+    assert "upright" not in load_model(saved).header["architecture"]["encoder"]
+    save_model(tmp_path / "new.npz", upright_header(False), arrays())
+    W, visible = np.random.default_rng(1).standard_normal((4, 2, 17)), np.ones((4, 17), bool)
+    old, new = load_model(saved), load_model(tmp_path / "new.npz")
+    np.testing.assert_array_equal(old.encode(W, visible), new.encode(W, visible))
+    assert np.abs(old.encode(W[:, ::-1], visible) - old.encode(W, visible)).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "head, axes, message",
+    [
+        (True, None, "encoder.axes"),
+        (False, np.ones((2, 17)), "encoder.axes"),
+        (True, np.ones((2, 16)), "encoder.axes"),
+        (True, np.full((2, 17), np.nan), "encoder.axes"),
+        ("no", np.ones((2, 17)), "neither true nor false"),
+        (None, np.ones((2, 17)), "neither true nor false"),
+    ],
+)
+def test_axes_that_do_not_fit_are_refused(tmp_path, head, axes, message):
+    held = arrays() if axes is None else upright_arrays(axes)
+    with pytest.raises(ModelError, match=message):
+        save_model(tmp_path / "bad.npz", upright_header(head), held)
+    assert not list(tmp_path.iterdir())
+
+
 def test_enough_is_counted_within_a_category():
     layout = LAYOUT.from_dict(
         {

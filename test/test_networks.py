@@ -12,15 +12,17 @@ from paul_ros.model import (
     check_size,
     dictionary_sizes,
     load_model,
+    normalise,
     save_model,
     to_centre,
     to_unit_size,
+    upright,
     weight_shapes,
 )
 from paul_ros.skeleton import Layout, anonymous_layout, load_layout
 from training import networks as networks_module
 from training.export import architecture
-from training.networks import build_networks
+from training.networks import build_networks, main_axes
 from training.recipe import Recipe
 
 COCO = load_layout("coco17")
@@ -34,7 +36,8 @@ def one_thread():
 
 def networks(layout=COCO, frames=6, **changes):
     recipe = Recipe.from_dict({"bottleneck": 3, "hidden": [5, 7], "width": 12, "blocks": 2, **changes})
-    return build_networks(layout, recipe, frames), recipe
+    axes = torch.randn(2, len(layout.names)) if recipe.upright else None
+    return build_networks(layout, recipe, frames, axes), recipe
 
 
 def views(points=17, frames=6, seed=0):
@@ -72,9 +75,9 @@ def shaken(paul):
 
 @pytest.mark.parametrize("encoder", ["residual", "convolutional"])
 @pytest.mark.parametrize("scale", ["free", "unit"])
-@pytest.mark.parametrize("blocks", [1, 3])
-def test_numpy_runs_what_torch_trained(tmp_path, encoder, scale, blocks):
-    paul, recipe = networks(encoder=encoder, scale=scale, blocks=blocks)
+@pytest.mark.parametrize("blocks, upright", [(1, False), (3, False), (1, True)])
+def test_numpy_runs_what_torch_trained(tmp_path, encoder, scale, blocks, upright):
+    paul, recipe = networks(encoder=encoder, scale=scale, blocks=blocks, upright=upright)
     model = saved(tmp_path / "m.npz", shaken(paul), recipe, scale=scale, image_unit=40.0)
     W, visible = views()
     x = torch.from_numpy(model.normalise(100 * W + 7, visible).astype(np.float32))
@@ -170,10 +173,13 @@ def test_dictionaries_go_from_the_width_to_the_bottleneck(width, blocks, bottlen
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.sampled_from(["residual", "convolutional"]), st.integers(3, 40), st.integers(1, 4), st.integers(1, 9))
-def test_the_header_foretells_every_weight(encoder, points, blocks, bottleneck):
+@given(
+    st.sampled_from(["residual", "convolutional"]),
+    *(st.integers(3, 40), st.integers(1, 4), st.integers(1, 9), st.booleans()),
+)
+def test_the_header_foretells_every_weight(encoder, points, blocks, bottleneck, upright):
     layout = anonymous_layout(points)
-    paul, recipe = networks(layout, encoder=encoder, blocks=blocks, bottleneck=bottleneck)
+    paul, recipe = networks(layout, encoder=encoder, blocks=blocks, bottleneck=bottleneck, upright=upright)
     expected = weight_shapes(header(recipe, layout), points)
     found = {name: tuple(value.shape) for name, value in paul.state_dict().items()}
     assert {**found, "mean_shape": (3, points)}.items() >= expected.items()
@@ -213,6 +219,98 @@ def test_categories_are_centred_and_measured_each_by_itself(seed, edges):
             np.testing.assert_allclose(np.mean(sizes, axis=0), 1, rtol=1e-6)
         else:
             np.testing.assert_allclose((own**2).sum((1, 2)) / len(points), 1)
+
+
+# --- upright views
+
+
+def turned(W, angle=1.0, mirrored=False):
+    """Views (N,2,P) turned in their plane by angles (N,), then mirrored in x where asked."""
+    cos, sin = np.cos(angle) * np.ones(len(W)), np.sin(angle) * np.ones(len(W))
+    side = np.where(mirrored, -1.0, 1.0) * np.ones(len(W))
+    return np.array([[side * cos, -side * sin], [sin, cos]]).transpose(2, 0, 1) @ W
+
+
+def normal_views(frames=40, points=17, seed=0):
+    W, visible = views(points, frames, seed)
+    return normalise(W, visible), visible
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 99), st.booleans())
+def test_upright_views_are_the_same_however_they_were_turned_or_mirrored(seed, hide):
+    rng = np.random.default_rng(seed)
+    W, visible = normal_views(seed=seed)
+    if not hide:
+        W = rng.standard_normal(W.shape)
+    axes = rng.standard_normal((2, 17))
+    other = turned(W, rng.uniform(-4, 4, len(W)), rng.random(len(W)) < 0.5)
+    found = upright(W, axes)
+    np.testing.assert_allclose(upright(other, axes), found, atol=1e-9)
+    # Turned rigidly, to where they are said to be.
+    np.testing.assert_allclose(found.swapaxes(1, 2) @ found, W.swapaxes(1, 2) @ W, atol=1e-9)
+    first, second = (found @ axes.T).transpose(2, 0, 1)
+    np.testing.assert_allclose(first[:, 0], 0, atol=1e-9)
+    assert (first[:, 1] > 0).all() and (second[:, 0] > 0).all()
+    if hide:
+        assert not found[~np.repeat(visible[:, None], 2, 1)].any()
+    twin = networks_module.upright(torch.from_numpy(W), torch.from_numpy(axes)).numpy()
+    np.testing.assert_allclose(twin, found, atol=1e-12)
+
+
+def test_views_that_have_no_direction_are_numbers_still():
+    W = np.zeros((1, 2, 17))
+    axes = np.ones((2, 17))
+    assert not upright(W, axes).any()
+    assert not networks_module.upright(torch.from_numpy(W), torch.from_numpy(axes)).any()
+
+
+@pytest.mark.parametrize("encoder", ["residual", "convolutional"])
+def test_codes_of_upright_views_do_not_turn_with_them(tmp_path, encoder):
+    paul, recipe = networks(encoder=encoder, upright=True)
+    model = saved(tmp_path / "m.npz", shaken(paul), recipe)
+    W, visible = views()
+    other = turned(W, 2.0, np.arange(len(W)) % 2 == 0)
+    assert model.header["architecture"]["encoder"]["upright"] is True
+    np.testing.assert_array_equal(model.weights["encoder.axes"], paul.encoder.axes.numpy())
+    np.testing.assert_allclose(model.encode(other, visible), model.encode(W, visible), atol=1e-5)
+    plain, recipe = networks(encoder=encoder)
+    model = saved(tmp_path / "p.npz", shaken(plain), recipe)
+    assert "encoder.axes" not in model.weights
+    assert np.abs(model.encode(other, visible) - model.encode(W, visible)).max() > 1e-3
+
+
+def test_axes_are_no_weights_to_be_trained():
+    paul, _ = networks(upright=True)
+    assert not any("axes" in name for name, _ in paul.named_parameters())
+    assert "encoder.axes" in paul.state_dict()
+
+
+def test_main_axes_are_the_longest_sums_of_points():
+    W = torch.from_numpy(normal_views()[0])
+    axes = main_axes(W, anonymous_layout(17))
+    torch.testing.assert_close(axes @ axes.T, torch.eye(2, dtype=torch.float64))
+    longest = [(W @ axis).square().sum() for axis in axes]
+    assert longest[0] > longest[1]
+    for other in torch.nn.functional.normalize(torch.randn(50, 17, dtype=torch.float64), dim=1):
+        assert (W @ other).square().sum() < longest[0]
+        rest = torch.nn.functional.normalize(other - (other @ axes[0]) * axes[0], dim=0)
+        assert (W @ rest).square().sum() < longest[1]
+
+
+def test_every_category_has_main_axes_of_its_own():
+    """With those of all points a view of the smaller object would have no direction."""
+    names = [f"p{i}" for i in range(11)]
+    parts = {"a": names[::2], "b": names[1::2]}
+    layout = Layout.from_dict({"name": "two", "names": names, "root": names, "categories": parts})
+    W = torch.randn(20, 2, 11)
+    W[:15, :, 1::2], W[15:, :, ::2] = 0, 0
+    W[:15] *= 10
+    axes = main_axes(W, layout)
+    for part in layout.parts:
+        own = axes[:, list(part.points)]
+        torch.testing.assert_close(own @ own.T, torch.eye(2))
+    assert (networks_module.upright(W, axes).norm(dim=(1, 2)) / W.norm(dim=(1, 2)) > 0.999).all()
 
 
 # --- decoder and shape encoder as one function of autograd's

@@ -63,7 +63,12 @@ def architecture(recipe: Recipe) -> dict:
     return {
         "bottleneck": recipe.bottleneck,
         "architecture": {
-            "encoder": {"kind": recipe.encoder, "width": recipe.width, "blocks": recipe.blocks},
+            "encoder": {
+                "kind": recipe.encoder,
+                "width": recipe.width,
+                "blocks": recipe.blocks,
+                "upright": recipe.upright,
+            },
             "decoder": {"kind": "mlp", "hidden": list(recipe.hidden)},
         },
     }

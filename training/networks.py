@@ -65,26 +65,45 @@ class ResidualBlock(nn.Module):
         return x + self.second(self.first(x).relu_()).relu_()
 
 
-class ResidualEncoder(nn.Module):
+class Encoder(nn.Module):
+    """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K).
+
+    Args:
+        axes: (2,P) what every view is brought upright by (``paul_ros.model.upright``); None: h sees views as they are.
+    """
+
+    def __init__(self, axes: Tensor | None) -> None:
+        super().__init__()
+        self.register_buffer("axes", axes)
+
+    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
+        return self.code(W if self.axes is None else upright(W, self.axes), visible)
+
+    def code(self, W: Tensor, visible: Tensor) -> Tensor:
+        """h of views that are turned already."""
+        raise NotImplementedError
+
+
+class ResidualEncoder(Encoder):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by residual blocks.
 
     Martinez et al. have 2 blocks; 6 of width 1024 are the depth of C3DPO (Novotny et al., ICCV 2019).
     """
 
-    def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
-        super().__init__()
+    def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axes: Tensor | None = None) -> None:
+        super().__init__(axes)
         self.input = nn.Linear(3 * points, width)
         self.blocks = nn.ModuleList(ResidualBlock(width) for _ in range(blocks))
         self.output = nn.Linear(width, bottleneck)
 
-    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
+    def code(self, W: Tensor, visible: Tensor) -> Tensor:
         x = self.input(torch.cat([W.flatten(1), visible.to(W.dtype)], dim=1)).relu_()
         for block in self.blocks:
             x = block(x)
         return self.output(x)
 
 
-class ConvolutionalEncoder(nn.Module):
+class ConvolutionalEncoder(Encoder):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by block-sparse coding.
 
     The encoder of Deep NRSfM (Kong and Lucey, ICCV 2019).  An orthographic view of S = sum_k c_k D_k by a camera R is
@@ -101,8 +120,8 @@ class ConvolutionalEncoder(nn.Module):
     is solved for), and the last layer is also told which points are visible.
     """
 
-    def __init__(self, points: int, bottleneck: int, width: int, blocks: int) -> None:
-        super().__init__()
+    def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axes: Tensor | None = None) -> None:
+        super().__init__(axes)
         atoms = dictionary_sizes(width, blocks, bottleneck)
         sizes = [(3 * atoms[0], points), *zip(atoms[1:], atoms)]
         self.dictionaries = nn.ParameterList(torch.empty(size) for size in sizes)
@@ -111,7 +130,7 @@ class ConvolutionalEncoder(nn.Module):
             nn.init.kaiming_normal_(dictionary)
         self.output = nn.Linear(6 * atoms[-1] + points, bottleneck)
 
-    def forward(self, W: Tensor, visible: Tensor) -> Tensor:
+    def code(self, W: Tensor, visible: Tensor) -> Tensor:
         first, *others = self.dictionaries
         x = (W @ first.T).reshape(len(W), 6, -1)
         x = F.relu(x - self.thresholds[0])
@@ -176,14 +195,15 @@ class Paul(nn.Module):
         return self.encoder(W, visible) if self.free_codes is None else self.free_codes(rows)
 
 
-def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
+def build_networks(layout: Layout, recipe: Recipe, frames: int, axes: Tensor | None = None) -> Paul:
     """The recipe's networks for a layout, with fresh weights from torch's default generator.
 
     Args:
         frames: number of training frames, for free codes.
+        axes: (2,P) of ``Encoder``.
     """
     points, K = len(layout.names), recipe.bottleneck
-    encoder = ENCODERS[recipe.encoder](points, K, recipe.width, recipe.blocks)
+    encoder = ENCODERS[recipe.encoder](points, K, recipe.width, recipe.blocks, axes)
     decoder = ShapeDecoder(layout, K, recipe.hidden, unit_size=recipe.scale == "free")
     shape_encoder = ShapeEncoder(points, K, recipe.hidden)
     free_codes = None
@@ -191,6 +211,26 @@ def build_networks(layout: Layout, recipe: Recipe, frames: int) -> Paul:
         free_codes = nn.Embedding(frames, K)
         nn.init.normal_(free_codes.weight, std=_FREE_CODE_SIZE)
     return Paul(encoder, decoder, shape_encoder, free_codes)
+
+
+def main_axes(W: Tensor, layout: Layout) -> Tensor:
+    """(2,P) weights of the points whose sums in views (F,2,P) are longest: the first two principal directions.
+
+    Of each category's points among themselves: else views of one category could be all but blind to the others' axes.
+    """
+    axes = W.new_zeros(2, W.shape[2])
+    for part in layout.parts:
+        own = W[:, :, list(part.points)].flatten(0, 1).double()
+        axes[:, list(part.points)] = torch.linalg.svd(own, full_matrices=False).Vh[:2].to(W)
+    return axes
+
+
+def upright(W: Tensor, axes: Tensor) -> Tensor:
+    """The torch twin of ``paul_ros.model.upright``."""
+    x, y = F.normalize(W @ axes[0], dim=1).unbind(1)
+    turned = torch.stack([torch.stack([y, -x], 1), torch.stack([x, y], 1)], 1) @ W
+    side = torch.where(turned[:, 0] @ axes[1] < 0, -1.0, 1.0)
+    return turned * torch.stack([side, torch.ones_like(side)], 1)[..., None]
 
 
 def to_centre(S: Tensor, layout: Layout) -> Tensor:

@@ -65,6 +65,9 @@ class Recipe:
     nuclear_weight: float = 0.0  # of the nuclear norm of a batch's shapes; the paper's ADL + low rank: 0.01
     handedness_weight: float = 1.0  # beyond the paper: keeps frames from settling on mirrored shapes
     bone_weight: float = 1.0  # beyond the paper: edges of the layout keep their lengths
+    upright: bool = False  # h sees every view turned and mirrored to one side: for cameras that roll freely, where it
+    # makes the next two needless. Only h does: cameras, depths and rays are those of the view as it is, so perspective
+    # may be fitted; what h no longer sees are gravity, and which side perspective shows to be near
     roll: float = 0.3  # radians; in-plane turns of W, an exact augmentation under an orthographic camera
     mirror_view: bool = True  # x-mirrored W is the same shape seen from behind: exact too
     fade: tuple[float, float] = (1.0, 1.0)  # shares of the run between which roll and mirror_view fade out: where

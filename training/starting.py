@@ -17,8 +17,10 @@ from torch import Tensor
 from paul_ros.files import write_atomically
 from paul_ros.metrics import procrustes
 from paul_ros.skeleton import Layout
+from training.data import TrainingData
 from training.distributed import from_first
 from training.networks import to_centre, to_unit_size
+from training.recipe import Recipe
 
 START = "start.npz"
 
@@ -69,11 +71,16 @@ def search(kind: str, W: np.ndarray, visible: np.ndarray, seed: int, progress: P
     )
 
 
+def start_identity(data: TrainingData, recipe: Recipe) -> dict[str, str | int]:
+    """All that a start depends on: runs that have this in common have one start."""
+    return {"data": data.sha256, **{name: getattr(recipe, name) for name in ("start", "scale", "seed")}}
+
+
 def kept_start(folder: Path, identity: dict, find: Callable[[], Start], device: torch.device) -> Start:
     """The start kept in a run's folder; if there is none, ``find`` one and keep it.
 
     Args:
-        identity: what the start belongs to, plain JSON values.
+        identity: what the start belongs to (``start_identity``), plain JSON values.
 
     Raises:
         StartError: the file is damaged, or belongs to something else.

@@ -27,10 +27,10 @@ from paul_ros.skeleton import Layout
 from training import starting
 from training.data import TrainingData
 from training.distributed import Share, from_first, is_first, processes, share_of
-from training.networks import Paul, build_networks
+from training.networks import Paul, build_networks, main_axes
 from training.objective import Terms, Views, paul_terms, regression_terms
 from training.recipe import Recipe
-from training.starting import START_UNIT, Lesson, Progress, Start, StartError, kept_start
+from training.starting import START_UNIT, Lesson, Progress, Start, StartError, kept_start, start_identity
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
 LOG_COLUMNS = (
@@ -38,6 +38,7 @@ LOG_COLUMNS = (
     *("learning_rate", "phase"),
 )
 REGRESSION, UNSUPERVISED = "regression", "unsupervised"
+_AXES_VIEWS = 1000  # evenly chosen frames that main axes are found from
 _LOG_EVERY = 100
 _CHECKPOINT_SECONDS = 30.0
 _WARM_UP_STEPS = 200
@@ -99,10 +100,13 @@ class Trainer:
         self.data, self.recipe, self.folder, self.device = data, recipe, folder, torch.device(device)
         if processes() > len(data.W) or 0 < recipe.batch < processes():
             raise TrainingError(f"{processes()} processes cannot share a batch of fewer frames: start fewer")
+        self._W = torch.from_numpy(data.W).to(self.device)
+        self._visible = torch.from_numpy(data.visible).to(self.device)
+        self._mirror = torch.tensor(data.layout.mirror, device=self.device)
         self.generator = torch.Generator().manual_seed(recipe.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(recipe.seed)
-            self.networks = build_networks(data.layout, recipe, len(data.W)).to(self.device)
+            self.networks = build_networks(data.layout, recipe, len(data.W), self._axes()).to(self.device)
         self.optimizer = self._optimizer()
         self._objective: nn.Module = _Objective(self.networks, data.layout, recipe)
         if processes() > 1:
@@ -111,9 +115,14 @@ class Trainer:
         self.step, self.seconds, self.rows = 0, 0.0, []
         self.stopped = False
         self._window = [0, 0.0, math.inf]  # steps and losses since the last look at them, and the mean before it
-        self._W = torch.from_numpy(data.W).to(self.device)
-        self._visible = torch.from_numpy(data.visible).to(self.device)
-        self._mirror = torch.tensor(data.layout.mirror, device=self.device)
+
+    def _axes(self) -> Tensor | None:
+        """What h brings views upright by, if the recipe asks for it."""
+        if not self.recipe.upright:
+            return None
+        frames = len(self.data.W)
+        rows = torch.linspace(0, frames - 1, min(frames, _AXES_VIEWS)).long()
+        return main_axes(self.views(rows).W, self.data.layout)
 
     @property
     def checkpoint(self) -> Path:
@@ -168,10 +177,7 @@ class Trainer:
         """
         if self.recipe.start == "random" or self.start is not None:
             return
-        identity = {
-            "data": self.data.sha256,
-            **{name: getattr(self.recipe, name) for name in ("start", "scale", "seed")},
-        }
+        identity = start_identity(self.data, self.recipe)
         try:
             start = kept_start(self.folder, identity, lambda: self._search(progress), self.device)
         except StartError as error:
