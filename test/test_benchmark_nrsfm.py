@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 
 from paul_ros import cli
-from training import experiments, reconstruction
+from training import experiments, reconstruction, starting
 from training.benchmark import METHODS, find_sequences
 from training.data import DataError
 from training.experiments import Keeping, Outcome, Run, chosen, perform, summary
 from training.published import NORMALISED_ERROR_PERCENT, published
+from training.recipe import Recipe
 from training.reconstruction import Reconstruction
+from training.starting import Start
+from training.trainer import TrainingError
 from training.truth import Sequence
 
 FRAMES, POINTS = 9, 14
@@ -150,7 +153,8 @@ def test_another_setting_is_another_run(folder, tmp_path, fake):
     paul(folder, tmp_path, *options)
     paul(folder, tmp_path, *options, "--set", "bottleneck=3")
     paul(folder, tmp_path, *options, "--hide", "0.3")
-    assert [recipe.bottleneck for _, recipe, _ in fake.calls] == [4, 3, 4]
+    usual = Recipe.load("nrsfm").bottleneck
+    assert [recipe.bottleneck for _, recipe, _ in fake.calls] == [usual, 3, usual]
     paul(folder, tmp_path, *options, "--set", "bottleneck=3")
     assert len(fake.calls) == 3
 
@@ -239,6 +243,81 @@ def test_the_real_trainer_runs_and_resumes(tmp_path):
     (again,) = perform(runs, Keeping(tmp_path, quiet=True))
     assert again.ne_flip_global_percent == first.ne_flip_global_percent and len(before) == 1
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("shapes.npz")} == before
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """What starts were searched for; a start is random shapes of its seed, and takes 100 s."""
+    found = []
+
+    def search(kind, W, visible, seed, progress):
+        found.append((kind, len(W), seed))
+        rng = np.random.default_rng(seed)
+        R = np.tile(np.eye(3, dtype=np.float32), (len(W), 1, 1))
+        return Start(np.arange(len(W)), rng.standard_normal((len(W), 3, W.shape[2])).astype(np.float32), R, 1.0, 100.0)
+
+    monkeypatch.setattr(starting, "search", search)
+    return found
+
+
+def made_runs(*methods, seeds=(0,), settings=()):
+    S = truth(0)
+    made = Sequence("made", S[:, :2], np.ones((FRAMES, POINTS), bool), S, np.zeros((0, 2), int), False)
+    few = ("regression_steps=2", "steps=2", "batch=4", "bottleneck=2")
+    own = {"linear": (), "rigid": ()}
+    return [Run(made, method, seed, own.get(method, (*few, *settings))) for seed in seeds for method in methods]
+
+
+def test_runs_that_begin_alike_share_one_start_and_its_seconds(tmp_path, searches):
+    runs = made_runs("paul", "adl", "linear", "rigid", seeds=(0, 1))
+    outcomes = perform(runs, Keeping(tmp_path, quiet=True))
+    assert searches == [("linear", FRAMES, 0), ("rigid", FRAMES, 0), ("linear", FRAMES, 1), ("rigid", FRAMES, 1)]
+    assert all(100 <= outcome.seconds < 110 for outcome in outcomes)
+    starts = [path.read_bytes() for path in sorted(tmp_path.glob("starts/*"))]
+    assert len(starts) == 4 and {path.read_bytes() for path in tmp_path.glob("made*/run/start.npz")} == set(starts)
+
+
+def test_a_shared_start_gives_what_an_own_one_does(tmp_path, searches):
+    perform(made_runs("paul"), Keeping(tmp_path / "shared", quiet=True))
+    (shared,) = perform(made_runs("adl"), Keeping(tmp_path / "shared", quiet=True))
+    (own,) = perform(made_runs("adl"), Keeping(tmp_path / "own", quiet=True))
+    assert len(searches) == 2 and shared.loss == own.loss
+    np.testing.assert_array_equal(shared.codes, own.codes)
+
+
+def test_restarts_share_starts_by_their_seeds(tmp_path, searches):
+    perform(made_runs("paul", settings=("restarts=2",)), Keeping(tmp_path, quiet=True))
+    perform(made_runs("adl", seeds=(0, 1, 2)), Keeping(tmp_path, quiet=True))
+    # The order of the frames is the seed's, so that seed 1 of one run has other data than restart 1 of another.
+    assert [seed for _, _, seed in searches] == [0, 1, 1, 2]
+
+
+def test_starts_of_other_scale_data_or_version_are_others(tmp_path, searches, monkeypatch):
+    perform(made_runs("paul"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paul", settings=("scale=free",)), Keeping(tmp_path, quiet=True))
+    assert len(searches) == 2
+    hidden = made_runs("adl")
+    hidden[0].sequence.visible[0, 0] = False
+    perform(hidden, Keeping(tmp_path, quiet=True))
+    assert len(searches) == 3
+    monkeypatch.setattr(experiments, "__version__", "another")
+    perform(made_runs("adl"), Keeping(tmp_path, quiet=True))
+    assert len(searches) == 4
+
+
+def test_fresh_searches_anew_and_a_damaged_start_says_so(tmp_path, searches):
+    perform(made_runs("paul"), Keeping(tmp_path, quiet=True))
+    (shared,) = tmp_path.glob("starts/*")
+    shared.write_bytes(shared.read_bytes()[:100])
+    with pytest.raises(TrainingError, match="cannot be read.*--fresh"):
+        perform(made_runs("adl"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paul", "adl"), Keeping(tmp_path, fresh=True, quiet=True))
+    assert len(searches) == 2
+
+
+def test_a_run_from_random_weights_has_no_start(tmp_path, searches):
+    perform(made_runs("paper"), Keeping(tmp_path, quiet=True))
+    assert not searches and not (tmp_path / "starts").exists()
 
 
 def test_codes_come_back_in_the_order_of_the_frames(fake, tmp_path):

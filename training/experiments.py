@@ -4,13 +4,15 @@
 A run is given its frames in an order of its seed's own, and only where points were seen: W and visible. Its folder
 under the work folder is named by what it depends on (data, recipe, seed, version of this package), so that an
 interrupted series goes on where it was and a changed setting begins anew. What is kept is the reconstruction; errors
-are computed whenever it is read.
+are computed whenever it is read. Starts are kept beside the runs, for all that begin with the same one to share it: it
+is found once, and the time that took counts for each of them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
+import json
 import re
 import shutil
 import sys
@@ -31,6 +33,7 @@ from training.data import DataError, TrainingData, load_training_data
 from training.evaluation import LEAST_VISIBLE, errors_of_signs
 from training.recipe import Recipe, RecipeError
 from training.reconstruction import Reconstruction
+from training.starting import START, start_identity
 from training.trainer import TrainingError
 from training.truth import Sequence
 
@@ -39,6 +42,8 @@ ERRORS = (DataError, LayoutError, RecipeError, TrainingError)
 
 RECIPES = {"paul": "nrsfm"}
 """Recipes of methods whose name is not their recipe's."""
+
+_STARTS = "starts"
 
 BAD_BASIN = 3.0
 """A run is in a bad basin where its NE, one flip for all, is above so many times the median of its method's runs."""
@@ -115,6 +120,8 @@ def perform(runs: list[Run], keeping: Keeping) -> list[Outcome]:
     for run in runs:
         _check(run)
     folders = [run.folder(keeping.work) for run in runs]
+    if keeping.fresh:
+        shutil.rmtree(keeping.work / _STARTS, ignore_errors=True)
     torch.set_num_threads(keeping.threads)
     outcomes = []
     # Into a log file, a line twice a minute.
@@ -150,9 +157,30 @@ def _perform(run: Run, folder: Path, fresh: bool, progress: Callable[[float], No
     if fresh:
         shutil.rmtree(folder, ignore_errors=True)
     if not kept.exists():
-        found = reconstruction.reconstruct(_given(run, folder), run.recipe(), folder / "run", progress)
+        data, recipe = _given(run, folder), run.recipe()
+        starts = _starts(data, recipe, folder)
+        for shared, own in starts:
+            _copied(shared, own)
+        found = reconstruction.reconstruct(data, recipe, folder / "run", progress)
+        for shared, own in starts:
+            _copied(own, shared)
         found.save(kept)
     return _judged(run, reconstruction.load_reconstruction(kept))
+
+
+def _starts(data: TrainingData, recipe: Recipe, folder: Path) -> list[tuple[Path, Path]]:
+    """Where a run's starts are kept for all runs, and where for itself."""
+    pairs = []
+    for one in reconstruction.restarts(recipe) if recipe.start != "random" else ():
+        identity = json.dumps([__version__, start_identity(data, one)], sort_keys=True)
+        shared = folder.parent / _STARTS / f"{hashlib.sha256(identity.encode()).hexdigest()[:16]}.npz"
+        pairs.append((shared, reconstruction.run_folder(folder / "run", recipe, one.seed) / START))
+    return pairs
+
+
+def _copied(source: Path, to: Path) -> None:
+    if source.exists() and not to.exists():
+        write_atomically(to, source.read_bytes())
 
 
 def _given(run: Run, folder: Path) -> TrainingData:
