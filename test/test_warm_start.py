@@ -1,30 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
 """The linear and the rigid start on small made-up sequences whose truth is known, and on data that fixes no shape."""
 
+from functools import partialmethod
+
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
-from training import warm_start
-from training.linear_model import Observations
+from training import linear_model, synchronise, warm_start
+from training.linear_model import LinearModel, Observations
 from training.starting import StartError
 from training.warm_start import linear_start, rigid_start
+
+EASY = {
+    "_STARTS": 8,
+    "_START_FRAMES": 30,
+    "_CANDIDATES": 1,
+    "_BASES": (2, 3, 4),
+    "_WARM": ((1.0, 3.0, 6), (0.3, 1.0, 8)),
+    "_COOLER": ((0.1, 0.1, 4),),
+    "_COOLED": 20,
+    "_CANDIDATE": ((0.1, 0.03, 2, 10), (0.03, 0.0, 2, 30)),
+    "_DETAIL": ((0.03, 10), (0.0075, 30)),
+    "_SETTLING": 3,
+    "_RIGID_ITERATIONS": 30,
+}
+HASTY = {
+    "_STARTS": 4,
+    "_WARM": ((1.0, 3.0, 2), (0.3, 1.0, 2)),
+    "_COOLER": ((0.1, 0.1, 2),),
+    "_COOLED": 4,
+    "_RIGID": ((1.0, 0.0, 2), (0.3, 0.0, 2)),
+    "_RIGID_ITERATIONS": 4,
+    "_CANDIDATE": ((0.1, 0.03, 1, 4), (0.03, 0.0, 1, 4)),
+    "_DETAIL": ((0.03, 4), (0.002, 8)),
+}
+"""Where all that is asked is that there be a start: every step is taken, down to the least noise."""
 
 
 @pytest.fixture(autouse=True)
 def few_starts(monkeypatch):
-    """Seconds instead of a minute: what is made up here is easy."""
-    for name, value in {
-        "_STARTS": 8,
-        "_START_FRAMES": 30,
-        "_CANDIDATES": 1,
-        "_BASES": (2, 3, 4),
-        "_WARM": ((1.0, 3.0, 6), (0.3, 1.0, 8)),
-        "_COOLER": ((0.1, 0.1, 8),),
-        "_CANDIDATE": ((0.1, 0.03, 2, 20), (0.03, 0.0, 2, 30)),
-        "_DETAIL": ((0.03, 15), (0.0075, 30)),
-    }.items():
-        monkeypatch.setattr(warm_start, name, value)
+    """A tenth of a second instead of a minute: what is made up here is easy."""
+    torch.set_num_threads(1)
+    patch(monkeypatch, warm_start, EASY)
+    patch(monkeypatch, linear_model, {"_REFINEMENTS": 2})
+    patch(monkeypatch, LinearModel, {"searched": partialmethod(LinearModel.searched, count=40)})
+    few = ((0.1, 4), (0.05, 4))
+    patch(monkeypatch, synchronise, {"_ROUNDS": (3, 4), "_REFIT": few, "_REBUILT": few})
+
+
+@pytest.fixture
+def hasty(few_starts, monkeypatch):
+    patch(monkeypatch, warm_start, HASTY)
+    patch(monkeypatch, LinearModel, {"searched": partialmethod(LinearModel.searched, count=5)})
+
+
+def patch(monkeypatch, module, values):
+    for name, value in values.items():
+        monkeypatch.setattr(module, name, value)
 
 
 def body(frames=40, points=12, ways=2, seed=0, spin=None):
@@ -87,7 +121,7 @@ def test_shapes_are_found_up_to_one_mirror_from_2d_alone(share):
     )
 
 
-def test_one_seed_gives_one_start_and_the_progress_grows_to_one():
+def test_one_seed_gives_one_start_and_the_progress_grows_to_one(hasty):
     _, W = body(12, 6)
     told = []
     first, second = (linear_start(W, shown(W), 3, told.append) for _ in range(2))
@@ -136,14 +170,14 @@ def test_points_beyond_the_limit_are_the_same_however_they_are_blocked(monkeypat
 
 def test_frames_beyond_the_limit_have_no_shapes(monkeypatch):
     S, W = body()
-    monkeypatch.setattr(warm_start, "_MAX_FRAMES", 25)
-    start = linear_start(W, shown(W), 0)
-    check(start, 25, 12)
+    monkeypatch.setattr(warm_start, "_MAX_FRAMES", 32)
+    start = linear_start(W, shown(W), 1)
+    check(start, 32, 12)
     assert error(start, S, shown(W)) < 1.0
 
 
 @pytest.mark.parametrize("frames, points", [(5, 8), (2, 6), (30, 5), (30, 4), (30, 3)])
-def test_few_frames_and_few_points_have_some_start(frames, points):
+def test_few_frames_and_few_points_have_some_start(frames, points, hasty):
     _, W = body(frames, points)
     for find in (linear_start, rigid_start):
         check(find(W, shown(W), 0), frames, points)
@@ -179,9 +213,7 @@ def degenerate(kind):
 @pytest.mark.parametrize(
     "kind", ["planar", "collinear", "rigid", "twins", "still camera", "still", "noise", "point", "outlier"]
 )
-def test_what_fixes_no_shape_is_no_crash(kind, monkeypatch):
-    for name, value in {"_STARTS": 4, "_CANDIDATE": ((0.1, 0.03, 2, 10),), "_DETAIL": ((0.03, 5), (0.002, 20))}.items():
-        monkeypatch.setattr(warm_start, name, value)
+def test_what_fixes_no_shape_is_no_crash(kind, hasty):
     W = degenerate(kind)
     visible = shown(W, 0.7)
     visible[:, -1] = False
@@ -190,7 +222,7 @@ def test_what_fixes_no_shape_is_no_crash(kind, monkeypatch):
     check(rigid_start(W, visible, 0), 20, 8)
 
 
-def test_frames_with_too_few_points_are_left_out():
+def test_frames_with_too_few_points_are_left_out(hasty):
     S, W = body()
     visible = shown(W)
     visible[3], visible[7, 2:] = False, False

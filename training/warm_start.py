@@ -37,9 +37,12 @@ _SAME_BASIN = 0.1  # nats a frame
 _BASES = (6, 10, 30)  # K of the starts, the candidates and the detail
 _WARM = ((1.0, 3.0, 15), (0.5, 2.0, 15), (0.3, 1.0, 20))  # sigma, penalty and steps of expectation maximisation
 _COOLER = ((0.2, 0.3, 20), (0.1, 0.1, 20))
+_COOLED = 60  # L-BFGS iterations after that
 _CANDIDATE = ((0.1, 0.03, 15, 60), (0.05, 0.01, 10, 60), (0.03, 0.0, 10, 160))  # and of L-BFGS iterations
 _DETAIL = ((0.03, 60), (0.015, 60), (0.0075, 80), (0.004, 100), (0.002, 100))  # sigma and L-BFGS iterations
 _SETTLING = 10
+_RIGID = ((1.0, 0.0, 20), (0.3, 0.0, 30))
+_RIGID_ITERATIONS = 100
 _DOUBT_MARGIN = 1.25
 _BLOCK = 512  # points
 _EXTENSION_RIDGE = 1e-3
@@ -111,15 +114,15 @@ def rigid_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progres
     """One rigid shape for all frames, by the same search without bases; a baseline. Arguments as ``linear_start``."""
     generator, tell = np.random.default_rng(seed), progress or (lambda done: None)
     seen = Observations.of(W, visible)
-    models = []
+    models, (sigma, penalty, _) = [], _RIGID[-1]
     for number in range(_CANDIDATES):
         model = LinearModel.random(len(seen), seen.points, 0, generator)
-        model = annealed(model, seen, ((1.0, 0.0, 20), (0.3, 0.0, 30)), generator)
-        models.append(model.polished(seen, 0.3, 0.0, 100))
+        model = annealed(model, seen, _RIGID, generator)
+        models.append(model.polished(seen, sigma, penalty, _RIGID_ITERATIONS))
         tell((number + 1) / _CANDIDATES)
-    best = min(models, key=lambda model: model.objective(seen, 0.3, 0.0))
+    best = _best(models, seen, _RIGID[-1])[0]
     shapes = centred_on_visible(best.V.expand(len(seen), -1, -1), seen.visible).numpy()
-    return Start(np.arange(len(seen)), shapes, best.R.numpy(), best.objective(seen, 0.3, 0.0))
+    return Start(np.arange(len(seen)), shapes, best.R.numpy(), best.objective(seen, sigma, penalty))
 
 
 def find_basin(seen: Observations, generator: np.random.Generator, progress: Progress) -> LinearModel:
@@ -134,7 +137,7 @@ def find_basin(seen: Observations, generator: np.random.Generator, progress: Pro
     models = _best(models, some, _WARM[-1])[: _STARTS // 4]
     for number, model in enumerate(models):
         sigma, penalty, _ = _COOLER[-1]
-        models[number] = annealed(model, some, _COOLER, generator).polished(some, sigma, penalty, 60)
+        models[number] = annealed(model, some, _COOLER, generator).polished(some, sigma, penalty, _COOLED)
         progress(0.5 + 0.2 * (number + 1) / len(models))
     models = _different(_best(models, some, _COOLER[-1]), some, _COOLER[-1])[:_CANDIDATES]
     for number, model in enumerate(models):
