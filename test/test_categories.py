@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tiny_data import FROM_RANDOM_WEIGHTS
 
 from paul_ros.lifter import TOO_FEW_POINTS, Lifter
 from paul_ros.model import load_model
@@ -41,7 +42,9 @@ def write(path, points, frames=20, seed=0, **more):
 def train(*arguments):
     parser = argparse.ArgumentParser()
     cli.add_arguments(parser)
-    return cli.run(parser.parse_args([str(argument) for argument in (*arguments, *SMALL, "--quiet")]))
+    return cli.run(
+        parser.parse_args([str(argument) for argument in (*FROM_RANDOM_WEIGHTS, *arguments, *SMALL, "--quiet")])
+    )
 
 
 @pytest.fixture

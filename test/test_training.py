@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from tiny_data import FROM_RANDOM_WEIGHTS
 
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records
@@ -66,7 +67,7 @@ def data_file(tmp_path):
 def train(*arguments):
     parser = argparse.ArgumentParser()
     cli.add_arguments(parser)
-    return cli.run(parser.parse_args([str(argument) for argument in arguments]))
+    return cli.run(parser.parse_args([str(argument) for argument in (*FROM_RANDOM_WEIGHTS, *arguments)]))
 
 
 def test_only_2d_reaches_the_trainer(data_file, tmp_path, monkeypatch):

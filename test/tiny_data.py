@@ -10,6 +10,9 @@ from training.starting import Start
 
 POINTS = 9
 
+FROM_RANDOM_WEIGHTS = ("--set", "start=random", "--set", "regression_steps=0")
+"""Options of `paul train` that spare tests the search for a start."""
+
 
 def sequence(frames=40, seed=0, hidden=0.0, bend=0.2, layout=None):
     """TrainingData of a body that bends one way; its camera-frame shapes (F,3,P) in image units; its rotations."""

@@ -11,6 +11,7 @@ views better.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import torch
@@ -23,6 +24,7 @@ _AGREEING = 0.975  # of nearest neighbours: 1.00 on sequences of one camera path
 _FLAT = 1e-4
 _TINY = 1e-100  # its cube is a number still
 _ROUNDS = (24, 24, 48)  # clusters
+_TRIES = 3
 _LEAST_CLUSTER = 8  # frames, on average
 _NEIGHBOURS = 10
 _BASES = 12
@@ -103,25 +105,46 @@ def synchronised(
 ) -> LinearModel:
     """A model whose frames show one mirror image; the one that is given, where they do.
 
+    Flips of one cluster at a time get stuck for some clusterings: a few are tried, and the most likely model is taken.
+    """
+    if agreeing_share(_shapes(model, seen)) >= _AGREEING:
+        return model
+    best, least = model, _settled(model, seen).objective(seen, _REBUILT[-1][0], 0.0)
+    for number in range(_TRIES):
+        tell = partial(_tell_part, progress, number, _TRIES)
+        found, cost = _flipped_in_rounds(model, seen, generator, tell)
+        if cost < least:
+            best, least = found, cost
+        if agreeing_share(_shapes(best, seen)) >= _AGREEING:
+            break
+    return best
+
+
+def _flipped_in_rounds(
+    model: LinearModel, seen: Observations, generator: np.random.Generator, progress: Progress
+) -> tuple[LinearModel, float]:
+    """The model after rounds of flips, and its mean negative log likelihood.
+
     Of few frames or wild poses neighbours tell little even at the truth: a round that makes the views less likely is
     taken back.
     """
     X = _shapes(model, seen)
-    if agreeing_share(X) >= _AGREEING:
-        return model
     bases, (sigma, _) = len(model.V) - 1, _REBUILT[-1]
     few = min(_BASES, bases)
     least = _settled(model, seen).objective(seen, sigma, 0.0)
     for number, clusters in enumerate(_ROUNDS):
-        done = number / len(_ROUNDS)
-        better = flipped(X, seen, few, clusters, generator, lambda share: progress(done + share / len(_ROUNDS)))
-        other = _rebuilt(better, seen, few, bases, generator)
+        tell = partial(_tell_part, progress, number, len(_ROUNDS))
+        other = _rebuilt(flipped(X, seen, few, clusters, generator, tell), seen, few, bases, generator)
         if (found := other.objective(seen, sigma, 0.0)) >= least:
             continue
         model, least, X = other, found, _shapes(other, seen)
         if agreeing_share(X) >= _AGREEING:
             break
-    return model
+    return model, least
+
+
+def _tell_part(progress: Progress, number: int, parts: int, done: float) -> None:
+    progress((number + done) / parts)
 
 
 def _rebuilt(X: Tensor, seen: Observations, few: int, bases: int, generator: np.random.Generator) -> LinearModel:
