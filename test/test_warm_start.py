@@ -142,8 +142,7 @@ def test_the_rigid_start_finds_a_rigid_shape():
     visible = shown(W, 0.7)
     start = rigid_start(W, visible, 0)
     check(start, 40, 12)
-    # Not nearer, as it takes the points to be noisy.
-    assert error(start, S, visible) < 4
+    assert error(start, S, visible) < 0.1
     assert np.ptp(start.shapes - start.shapes[:, :, :1], axis=0).max() < 1e-9
     np.testing.assert_allclose(np.where(visible[:, None], start.shapes, 0).sum(2), 0, atol=1e-9)
 

@@ -43,6 +43,7 @@ _DETAIL = ((0.03, 60), (0.015, 60), (0.0075, 80), (0.004, 100), (0.002, 100))  #
 _SETTLING = 10
 _RIGID = ((1.0, 0.0, 20), (0.3, 0.0, 30))
 _RIGID_ITERATIONS = 100
+_RIGID_NOISE = 0.01
 _DOUBT_MARGIN = 1.25
 _BLOCK = 512  # points
 _EXTENSION_RIDGE = 1e-3
@@ -121,8 +122,10 @@ def rigid_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progres
         models.append(model.polished(seen, sigma, penalty, _RIGID_ITERATIONS))
         tell((number + 1) / _CANDIDATES)
     best = _best(models, seen, _RIGID[-1])[0]
+    # Without bases noise only weighs how sharply cameras are told, which shrinks a body that is rigid indeed.
+    best = best.polished(seen, _RIGID_NOISE, penalty, _RIGID_ITERATIONS)
     shapes = centred_on_visible(best.V.expand(len(seen), -1, -1), seen.visible).numpy()
-    return Start(np.arange(len(seen)), shapes, best.R.numpy(), best.objective(seen, sigma, penalty))
+    return Start(np.arange(len(seen)), shapes, best.R.numpy(), best.objective(seen, _RIGID_NOISE, penalty))
 
 
 def find_basin(seen: Observations, generator: np.random.Generator, progress: Progress) -> LinearModel:
