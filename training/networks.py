@@ -6,6 +6,8 @@ Parameter names are those of the model file, so that the trained encoder and dec
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -65,7 +67,7 @@ class ResidualBlock(nn.Module):
         return x + self.second(self.first(x).relu_()).relu_()
 
 
-class Encoder(nn.Module):
+class Encoder(nn.Module, ABC):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K).
 
     Args:
@@ -79,9 +81,9 @@ class Encoder(nn.Module):
     def forward(self, W: Tensor, visible: Tensor) -> Tensor:
         return self.code(W if self.axes is None else upright(W, self.axes), visible)
 
+    @abstractmethod
     def code(self, W: Tensor, visible: Tensor) -> Tensor:
-        """h of views that are turned already."""
-        raise NotImplementedError
+        """h of views that are upright already."""
 
 
 class ResidualEncoder(Encoder):
