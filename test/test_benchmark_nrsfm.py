@@ -159,6 +159,17 @@ def test_another_setting_is_another_run(folder, tmp_path, fake):
     assert len(fake.calls) == 3
 
 
+def test_a_start_stays_a_start_whatever_is_set_for_others(folder, tmp_path, fake, capsys):
+    settings = ("start=random", "regression_steps=0", "steps=100", "bottleneck=3")
+    options = [word for setting in settings for word in ("--set", setting)]
+    paul(folder, tmp_path, "--seeds", "1", "--methods", "paul,linear,rigid", "--sequences", "made", *options)
+    found = [(recipe.start, recipe.steps, recipe.bottleneck) for _, recipe, _ in fake.calls]
+    assert found == [("random", 100, 3), ("linear", 0, 3), ("rigid", 0, 3)]
+    told = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
+    assert [line.split(":")[0] for line in told] == ["linear", "rigid"]
+    assert all("start=random, regression_steps=0, steps=100 left out" in line for line in told)
+
+
 def test_points_are_hidden_and_the_truth_of_all_judges(folder, tmp_path, fake):
     report = paul(folder, tmp_path, "--seeds", "2", "--methods", "paul", "--sequences", "made", "--hide", "0.3")
     first, second = (data for data, _, _ in fake.calls)
@@ -208,7 +219,8 @@ def test_equal_losses_choose_the_first_seed():
     [
         (["--sequences", "dance"], "no sequence dance"),
         (["--methods", "paull"], "no recipe 'paull'"),
-        (["--set", "bottelneck=3"], "unknown recipe setting bottelneck"),
+        (["--set", "bottelneck=3"], "method paul: unknown recipe setting bottelneck"),
+        (["--methods", "linear,adl", "--set", "regression_steps=0"], "method adl: start: linear needs"),
         (["--sequences", "unlabelled"], "no array S"),
         (["--hide", "0.9"], "too few points"),
     ],

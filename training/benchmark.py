@@ -18,6 +18,10 @@ from training.truth import Sequence, load_sequence
 
 METHODS = ("paul", "adl", "adl_low_rank", "linear", "rigid")
 
+_STARTS = ("linear", "rigid")
+_TRAINING = ("start", "regression_steps", "steps")
+"""Settings that would make something else of a start that is a method of its own."""
+
 
 def find_sequences(folder: Path, names: list[str] | None = None) -> list[Sequence]:
     """The npz files of a folder that hold W and S, all or the named ones; others are told of on stderr.
@@ -47,11 +51,24 @@ def find_sequences(folder: Path, names: list[str] | None = None) -> list[Sequenc
 def plan(sequences: list[Sequence], methods: list[str], seeds: int, hide: float, settings: list[str]) -> list[Run]:
     """All runs, sequence by sequence; each seed hides other points."""
     return [
-        Run(sequence.hiding(hide, seed) if hide else sequence, method, seed, tuple(settings))
+        Run(sequence.hiding(hide, seed) if hide else sequence, method, seed, _fitting(method, settings))
         for sequence in sequences
         for method in methods
         for seed in range(seeds)
     ]
+
+
+def _fitting(method: str, settings: list[str]) -> tuple[str, ...]:
+    """The overrides under which a method still is what its name says."""
+    refused = _TRAINING if method in _STARTS else ()
+    return tuple(setting for setting in settings if setting.partition("=")[0].strip() not in refused)
+
+
+def _tell_of_left_out(methods: list[str], settings: list[str]) -> None:
+    for method in methods:
+        fitting = _fitting(method, settings)
+        if left_out := [setting for setting in settings if setting not in fitting]:
+            print(f"{method}: {', '.join(left_out)} left out, for it is the start alone", file=sys.stderr)
 
 
 def run(
@@ -69,6 +86,7 @@ def run(
     Raises: see ``find_sequences`` and ``training.experiments.perform``.
     """
     found = find_sequences(folder, sequences)
+    _tell_of_left_out(methods, settings)
     outcomes = perform(plan(found, methods, seeds, hide, settings), keeping)
     return report(outcomes) | {"hidden_share": hide, "settings": settings, "versions": versions()}
 

@@ -71,8 +71,11 @@ class Run:
     def recipe(self) -> Recipe:
         """Its recipe; raises RecipeError. A recipe that trains several runs itself has seeds of its own in each."""
         name = RECIPES.get(self.method, self.method)
-        restarts = Recipe.load(name, list(self.settings)).restarts
-        return Recipe.load(name, [*self.settings, f"seed={self.seed * restarts}"])
+        try:
+            restarts = Recipe.load(name, list(self.settings)).restarts
+            return Recipe.load(name, [*self.settings, f"seed={self.seed * restarts}"])
+        except RecipeError as error:
+            raise RecipeError(f"method {self.method}: {error}") from None
 
     def order(self) -> np.ndarray:
         """(F,) numbers of the frames in the order in which the trainer is given them."""
