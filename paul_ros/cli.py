@@ -194,7 +194,7 @@ def _add_benchmark_onp(subjects: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--seed", type=_natural, default=0, help="of the random problems (default: %(default)s)")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write all rows as JSON")
-    parser.add_argument("--plot", metavar="FILE.png", type=Path, help="draw angles, residuals, times and 3D errors")
+    parser.add_argument("--plot", metavar="FILE.png", type=_picture, help="draw angles, residuals, times and 3D errors")
     parser.set_defaults(run=_benchmark_onp)
 
 
@@ -202,6 +202,13 @@ def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is no whole number above 0")
     return int(text)
+
+
+def _picture(text: str) -> Path:
+    path = Path(text)
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise argparse.ArgumentTypeError(f"'{text}' ends neither in .png nor in .svg or .pdf")
+    return path
 
 
 def _natural(text: str) -> int:
@@ -263,7 +270,7 @@ def _add_benchmark_nrsfm(subjects: argparse._SubParsersAction) -> None:
     parser.add_argument("--hide", metavar="SHARE", type=_share, default=0.0, help="of every frame's points, at random")
     _add_runs(parser, Path("out/benchmark_nrsfm"))
     parser.add_argument("--json", metavar="FILE", type=Path, help="write all rows as JSON")
-    parser.add_argument("--plot", metavar="FILE.png", type=Path, help="draw all runs and the published figures")
+    parser.add_argument("--plot", metavar="FILE.png", type=_picture, help="draw all runs and the published figures")
     parser.set_defaults(run=_benchmark_nrsfm)
 
 
@@ -449,7 +456,9 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("data", metavar="DATA", type=Path, nargs="?", help="npz with W and the truth S, see below")
     parser.add_argument("--truth", metavar="DATA", type=Path, help="MODEL holds shapes: judge them by this npz")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the report as JSON")
-    parser.add_argument("--plot", metavar="FILE.png", type=Path, help="draw frames over their truth, and all errors")
+    parser.add_argument(
+        "--plot", metavar="FILE.png", type=_picture, help="draw frames over their truth, and all errors"
+    )
     parser.set_defaults(run=_evaluate, usage_error=parser.error)
 
 

@@ -262,6 +262,13 @@ def test_data_or_truth_must_be_named(model_file, capsys):
         assert end.value.code == 2 and "--truth" in capsys.readouterr().err
 
 
+def test_a_picture_of_no_known_kind_is_told_before_any_work(model_file, monkeypatch, capsys):
+    monkeypatch.setattr(evaluation, "evaluate_model", lambda *_: pytest.fail("evaluated in vain"))
+    with pytest.raises(SystemExit) as end:
+        cli.main(["evaluate", str(model_file), "data.npz", "--plot", "e.xyz"])
+    assert end.value.code == 2 and "'e.xyz' ends neither in .png" in capsys.readouterr().err
+
+
 # --- variants of a sequence
 
 
