@@ -1,11 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are there whole or not at all."""
+"""Files that are written whole or not at all, and read without running anything that they hold."""
 
 from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Collection
 from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+
+class NpzError(ValueError):
+    """An npz that cannot be used; the text says why, and goes after the file's name."""
+
+
+def read_npz(
+    file: str | os.PathLike | BinaryIO, needed: Collection[str], optional: Collection[str] = ()
+) -> dict[str, np.ndarray]:
+    """Arrays of an npz by their names; nothing else of it is opened.
+
+    Raises:
+        NpzError: it cannot be read, is damaged, holds pickled objects where arrays are wanted, or lacks a needed one.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            there = archive.files
+            arrays = {name: archive[name] for name in (*needed, *optional) if name in there}
+    except FileNotFoundError as error:
+        raise NpzError("is not there") from error
+    except Exception as error:  # numpy and zipfile report damage in a dozen ways; numpy's own advice is to unpickle
+        raise NpzError("holds pickled objects or is no npz: save plain arrays with np.savez") from error
+    missing = [name for name in needed if name not in there]
+    if missing:
+        raise NpzError(f"has no array {' or '.join(missing)}; it has {', '.join(there) or 'none'}")
+    return arrays
 
 
 def write_atomically(path: str | os.PathLike, data: bytes) -> None:

@@ -148,13 +148,24 @@ def test_a_saved_reconstruction_is_read_again(tmp_path):
         np.testing.assert_array_equal(getattr(again, name), value)
 
 
-@pytest.mark.parametrize("contents", [None, dict(W=np.zeros((4, 2, 5))), dict(shapes=np.zeros((4, 2, 5)))])
-def test_what_is_no_reconstruction_is_refused(tmp_path, contents):
+NO_RECONSTRUCTION = {
+    "nothing": (None, "is not there"),
+    "data": (dict(W=np.zeros((4, 2, 5))), "has no array shapes; it has .*W"),
+    "2D": (dict(shapes=np.zeros((4, 2, 5))), r"not \(F,3,P\)"),
+    "pickled": (dict(shapes=np.array([{}])), "plain arrays with np.savez"),
+    "a loss in words": (dict(shapes=np.zeros((4, 3, 5)), loss="low"), "no numbers"),
+}
+
+
+@pytest.mark.parametrize("case", NO_RECONSTRUCTION)
+def test_what_is_no_reconstruction_is_refused(tmp_path, case):
+    contents, message = NO_RECONSTRUCTION[case]
     path = tmp_path / "x.npz"
     if contents:
         np.savez(path, **{"rotations": np.zeros((4, 3, 3)), "loss": 0.0, "seconds": 0.0, **contents})
-    with pytest.raises(DataError, match="no saved reconstruction"):
+    with pytest.raises(DataError, match=f"no saved reconstruction: .*{message}") as caught:
         load_reconstruction(path)
+    assert "allow_pickle" not in str(caught.value)
 
 
 # --- paul train

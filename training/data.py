@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import msg_adapters
+from paul_ros.files import NpzError, read_npz
 from paul_ros.model import centre, enough_visible, min_visible
 from paul_ros.parameters import DEFAULTS
 from paul_ros.placement import centred_view
@@ -110,17 +111,11 @@ def load_training_data(
 
 def _read_npz(path: Path, layout: Layout | None) -> tuple[np.ndarray, np.ndarray, bool, Layout]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if "W" not in archive.files:
-                raise DataError(f"'{path}' has no array W (F,2,P); it has {', '.join(archive.files) or 'none'}")
-            W = archive["W"]
-            layout = layout or _guessed_layout(W, archive, path)
-            visible = _flags(archive, "visible", path)
-            calibrated = _flags(archive, "calibrated", path)
-    except (DataError, LayoutError):
-        raise
-    except Exception as error:  # numpy and zipfile report damage in a dozen ways
-        raise DataError(f"'{path}' is no npz file of plain arrays ({type(error).__name__}: {error})") from error
+        arrays = read_npz(path, ("W",), ("visible", "calibrated", *([] if layout else ["edges"])))
+    except NpzError as error:
+        raise DataError(f"'{path}' {error} (training needs W (F,2,P))") from error
+    W, layout = arrays["W"], layout or _guessed_layout(arrays, path)
+    visible, calibrated = _flags(arrays, "visible", path), _flags(arrays, "calibrated", path)
     if W.ndim != 3 or W.shape[1:] != (2, len(layout.names)) or W.dtype.kind not in "fiu":
         raise DataError(
             f"W in '{path}' must be numbers (F,2,{len(layout.names)}) for layout '{layout.name}', it is "
@@ -138,14 +133,15 @@ def _read_npz(path: Path, layout: Layout | None) -> tuple[np.ndarray, np.ndarray
     return W, visible, calibrated is not None and calibrated.size == 1 and bool(calibrated.all()), layout
 
 
-def _guessed_layout(W: np.ndarray, archive: np.lib.npyio.NpzFile, path: Path) -> Layout:
+def _guessed_layout(arrays: dict[str, np.ndarray], path: Path) -> Layout:
     """The layout of a file that comes without one, by its number of points."""
+    W = arrays["W"]
     if W.ndim != 3 or W.shape[1] != 2 or W.dtype.kind not in "fiu":
         raise DataError(f"W in '{path}' must be numbers (F,2,P), it is {W.dtype} {W.shape}")
     usual = load_layout(_USUAL)
     if W.shape[2] == len(usual.names):
         return usual
-    edges = archive["edges"] if "edges" in archive.files else np.zeros((0, 2), int)
+    edges = arrays.get("edges", np.zeros((0, 2), int))
     if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu":
         raise DataError(f"edges in '{path}' must be whole numbers (E,2), they are {edges.dtype} {edges.shape}")
     try:
@@ -154,11 +150,11 @@ def _guessed_layout(W: np.ndarray, archive: np.lib.npyio.NpzFile, path: Path) ->
         raise DataError(f"the points of '{path}' make no layout: {error}") from None
 
 
-def _flags(archive: np.lib.npyio.NpzFile, name: str, path: Path) -> np.ndarray | None:
+def _flags(arrays: dict[str, np.ndarray], name: str, path: Path) -> np.ndarray | None:
     """An optional array of the file as bool; anything but bool, 0 and 1 is refused, not guessed."""
-    if name not in archive.files:
+    if name not in arrays:
         return None
-    flags = archive[name]
+    flags = arrays[name]
     if flags.dtype.kind not in "biuf" or not np.isin(flags, (0, 1)).all():
         raise DataError(f"{name} in '{path}' must be bool (or 0 and 1), it is {flags.dtype}")
     return flags.astype(bool)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from paul_ros.files import write_atomically
+from paul_ros.files import NpzError, read_npz, write_atomically
 from training.data import DataError, TrainingData
 from training.objective import Views, fit, paul_terms
 from training.recipe import Recipe
@@ -60,21 +60,17 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
         DataError: there is no such file, or it holds something else.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        found = Reconstruction(
-            arrays["shapes"],
-            arrays["rotations"],
-            arrays.get("codes"),
-            float(arrays["loss"]),
-            float(arrays["seconds"]),
-        )
-    except Exception as error:  # numpy and zipfile report damage in a dozen ways
-        raise DataError(f"'{path}' is no saved reconstruction ({type(error).__name__}: {error})") from error
-    frames = len(found.shapes)
-    if found.shapes.ndim != 3 or found.shapes.shape[1] != 3 or found.rotations.shape != (frames, 3, 3):
-        raise DataError(f"'{path}' is no saved reconstruction: shapes are {found.shapes.shape}, not (F,3,P)")
-    return found
+        arrays = read_npz(path, ("shapes", "rotations", "loss", "seconds"), ("codes",))
+    except NpzError as error:
+        raise DataError(f"'{path}' is no saved reconstruction: it {error}") from error
+    shapes, rotations = arrays["shapes"], arrays["rotations"]
+    if shapes.ndim != 3 or shapes.shape[1] != 3 or rotations.shape != (len(shapes), 3, 3):
+        raise DataError(f"'{path}' is no saved reconstruction: shapes are {shapes.shape}, not (F,3,P)")
+    try:
+        loss, seconds = float(arrays["loss"]), float(arrays["seconds"])
+    except (TypeError, ValueError) as error:
+        raise DataError(f"'{path}' is no saved reconstruction: loss and seconds are no numbers") from error
+    return Reconstruction(shapes, rotations, arrays.get("codes"), loss, seconds)
 
 
 @dataclass(frozen=True)

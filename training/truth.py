@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from paul_ros.files import NpzError, read_npz
 from training.data import DataError
 
 
@@ -83,13 +84,10 @@ def load_sequence(path: str | Path) -> Sequence:
     if not path.is_file():
         raise DataError(f"no data file '{path}'")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in ("W", "S", "visible", "edges", "metres") if name in archive.files}
-    except Exception as error:  # numpy and zipfile report damage in a dozen ways
-        raise DataError(f"'{path}' is no npz file of plain arrays ({type(error).__name__}: {error})") from error
+        arrays = read_npz(path, ("W", "S"), ("visible", "edges", "metres"))
+    except NpzError as error:
+        raise DataError(f"'{path}' {error} (judging needs W (F,2,P) and the truth S (F,3,P))") from error
     for name, rows in (("W", 2), ("S", 3)):
-        if name not in arrays:
-            raise DataError(f"'{path}' has no array {name} (F,{rows},P): W and the truth S are needed to judge with")
         if arrays[name].ndim != 3 or arrays[name].shape[1] != rows or arrays[name].dtype.kind not in "fiu":
             raise DataError(
                 f"{name} in '{path}' must be numbers (F,{rows},P), it is {arrays[name].dtype} {arrays[name].shape}"
