@@ -102,6 +102,17 @@ def test_a_start_of_some_frames_is_no_reconstruction(monkeypatch):
     assert reconstruct(given[0], Recipe.from_dict(STARTED)).shapes.shape == given[1].shape
 
 
+def test_a_wild_point_is_told_before_the_first_step(tmp_path, file):
+    data = sequence()[0]
+    data.W[7, 0, 2] = 1e5
+    with pytest.raises(DataError, match="frame 7 of made up .* by point p02"):
+        reconstruct(data, Recipe.from_dict({**FREE, "steps": 5}))
+    np.savez(file, W=data.W)
+    with pytest.raises(DataError, match="frame 7 of seq.npz .* by point p02"):
+        train(file, "--shapes", tmp_path / "s.npz", *AS_OPTIONS)
+    assert not list((tmp_path / "s.run").glob("*"))
+
+
 def test_restarts_are_ranked_by_their_loss(tmp_path):
     data = sequence()[0]
     recipe = Recipe.from_dict({**FREE, "steps": 5, "restarts": 3, "seed": 4})

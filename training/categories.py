@@ -48,7 +48,12 @@ def load_files(
             f"each file is a category, named by its file, and {', '.join(twice)} is there twice: rename one; "
             f"recordings of one layout are joined with --layout (points41, say, for 41 points)"
         )
-    return side_by_side(names, parts)
+    data = side_by_side(names, parts)
+    points = {len(part.layout.names) for part in parts}
+    if len(points) > 1:
+        return data
+    note = f"taken as categories of objects; recordings of one object are joined with --layout points{points.pop()}"
+    return replace(data, notes=(*data.notes, note))
 
 
 def one_after_another(parts: list[TrainingData]) -> TrainingData:

@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -19,7 +20,7 @@ from paul_ros.model import ModelError, check_size
 from paul_ros.parameters import DEFAULTS
 from paul_ros.skeleton import LayoutError, load_layout
 from training.categories import load_files
-from training.data import DataError, TrainingData
+from training.data import DataError, TrainingData, check_sizes
 from training.distributed import is_first, joined
 from training.encoder_fit import fit_encoder
 from training.export import architecture, export_model
@@ -107,6 +108,7 @@ def run(args: argparse.Namespace) -> int:
     folders = _run_folders(args, recipe)
     layout = load_layout(args.layout) if args.layout else None
     data = load_files(args.data, layout, args.topic, args.min_confidence)
+    data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale)))
     _check(args, recipe, data)
     torch.set_num_threads(max(1, args.threads))
     device = _device(args.device)
@@ -171,7 +173,7 @@ def _forget(folders: list[Path]) -> None:
 def _introduce(data: TrainingData, args: argparse.Namespace) -> None:
     if not is_first():
         return
-    left_out = f", {data.left_out} left out (too few points)" if data.left_out else ""
+    left_out = f", {data.left_out} left out (too few points, or all on one line)" if data.left_out else ""
     print(f"{len(data.W)} frames of layout {data.layout.name} from {data.source}{left_out}", file=sys.stderr)
     for note in data.notes:
         print(f"note: {note}", file=sys.stderr)

@@ -31,6 +31,18 @@ RAY_LIMIT = 20.0
 _USUAL = "coco17"
 """Layout of 17 points, where none is named."""
 
+_LEAST_FRAMES, _LEAST_POINTS = 3, 4
+"""Orthographic views of so many points fix a rigid shape up to its mirror image (Ullman, Proc. R. Soc. B, 1979)."""
+
+_ROUNDING = 4 * float(np.finfo(np.float32).eps)
+"""Of coordinates, as a share of the largest."""
+
+_WILD = 30.0
+"""A frame so many times as large as the median one holds a point that is out of place."""
+
+_VARIED = 4.0
+"""95th over 5th percentile of frame sizes.  Of views of one fixed scale that were measured it was 2.1 at most."""
+
 _BLOCK = 1024
 """Frames that are looked at together: dense data is large, and a copy of it larger still."""
 
@@ -77,6 +89,37 @@ class TrainingData:
         return digest.hexdigest()
 
 
+def check_sizes(data: TrainingData, scale: str) -> tuple[str, ...]:
+    """What the sizes of the frames say against the recipe's scale: notes, a sentence each.
+
+    Raises:
+        DataError: with one scale for all, a frame would outweigh the others.
+    """
+    size = np.concatenate([_rms(data.W[rows], data.visible[rows]) for rows in _blocks(len(data.W))])
+    largest, middle = int(size.argmax()), float(np.median(size))
+    notes = []
+    if size[largest] > _WILD * middle:
+        wild = _wild(data, largest, size[largest] / middle)
+        if scale == "unit":
+            raise DataError(f"{wild}: with scale: unit it outweighs all others, so hide that point in visible")
+        notes.append(wild)
+    if scale == "unit":
+        low, high = np.percentile(size, [5, 95])
+        if data.calibrated:
+            notes.append("scale: unit takes all views to be of one scale, but these are rays: what is near is larger")
+        elif high > _VARIED * low:
+            notes.append(f"scale: unit takes all views to be of one scale, but their sizes vary {high / low:.0f} fold")
+    return tuple(notes)
+
+
+def _wild(data: TrainingData, frame: int, ratio: float) -> str:
+    seen = data.visible[frame]
+    offset = data.W[frame] - np.median(data.W[frame][:, seen], axis=1, keepdims=True)
+    point = data.layout.names[int(np.where(seen, np.linalg.norm(offset, axis=0), -1.0).argmax())]
+    counted = ", counted without those left out," if data.left_out else ""
+    return f"frame {frame} of {data.source}{counted} is {ratio:.0f} times as large as the median one, by point {point}"
+
+
 def load_training_data(
     path: str | Path,
     layout: Layout | None = None,
@@ -101,12 +144,13 @@ def load_training_data(
     path = Path(path)
     if not path.exists():
         raise DataError(f"no data at '{path}'")
+    guessed = layout is None and path.suffix == ".npz"
     if path.suffix == ".npz":
         W, visible, calibrated, layout = _read_npz(path, layout)
     else:
         layout = layout or load_layout(_USUAL)
         W, visible, calibrated = _read_bag(path, layout, topic, min_confidence)
-    return _checked(W, visible, layout, calibrated, path)
+    return _checked(W, visible, layout, calibrated, path, guessed)
 
 
 def _read_npz(path: Path, layout: Layout | None) -> tuple[np.ndarray, np.ndarray, bool, Layout]:
@@ -204,7 +248,9 @@ def _bag_keypoints(
     return frames, cameras.pop() if cameras else None, refused
 
 
-def _checked(W: np.ndarray, visible: np.ndarray, layout: Layout, calibrated: bool, path: Path) -> TrainingData:
+def _checked(
+    W: np.ndarray, visible: np.ndarray, layout: Layout, calibrated: bool, path: Path, guessed: bool
+) -> TrainingData:
     limit = RAY_LIMIT if calibrated else ABSURD
     visible = visible & np.isfinite(W).all(1)
     if any((np.abs(W[rows]).max(1) > limit)[visible[rows]].any() for rows in _blocks(len(W))):
@@ -214,21 +260,25 @@ def _checked(W: np.ndarray, visible: np.ndarray, layout: Layout, calibrated: boo
         )
     with np.errstate(over="ignore", invalid="ignore"):  # of hidden points
         W = np.where(visible[:, None], W.astype(np.float32, copy=False), np.float32(0))
-    enough = enough_visible(visible, layout) & (_spread(W, visible) > 0)
+    enough = enough_visible(visible, layout) & ~_on_one_line(W, visible)
     if not enough.any():
         raise DataError(
             f"none of the {len(W)} frames in '{path}' has {min_visible(len(layout.names))} visible points "
-            f"at different places: nothing to train on"
+            f"that are not all on one line: nothing to train on"
         )
     if not enough.all():
         W, visible = W[enough], visible[enough]
     _check_motion(W, visible, path)
     _check_twins(W, visible, layout, path)
-    return TrainingData(W, visible, layout, calibrated, path.name, int((~enough).sum()), _notes(visible, layout))
+    return TrainingData(
+        W, visible, layout, calibrated, path.name, int((~enough).sum()), _notes(visible, layout, guessed)
+    )
 
 
 def _check_motion(W: np.ndarray, visible: np.ndarray, path: Path) -> None:
     """Refuse frames that are all the same: what does not turn shows no depth."""
+    if len(W) == 1:
+        raise DataError(f"'{path}' has one frame only: depth shows only where something moves")
     first = W[0]
     for rows in _blocks(len(W)):
         both = (visible[rows] & visible[0])[:, None]
@@ -250,23 +300,36 @@ def _check_twins(W: np.ndarray, visible: np.ndarray, layout: Layout, path: Path)
             )
 
 
-def _notes(visible: np.ndarray, layout: Layout) -> tuple[str, ...]:
+def _notes(visible: np.ndarray, layout: Layout, guessed: bool) -> tuple[str, ...]:
+    notes, (frames, points) = [], visible.shape
+    if guessed and layout.name == _USUAL:
+        notes.append(f"{points} points taken as {_USUAL}; --layout points{points} if they are not")
+    if frames < _LEAST_FRAMES or points < _LEAST_POINTS:
+        notes.append(
+            f"{frames} frames of {points} points leave the depth open: even of a rigid object it takes "
+            f"{_LEAST_FRAMES} frames of {_LEAST_POINTS} points"
+        )
     never = [name for name, seen in zip(layout.names, visible.any(0)) if not seen]
-    if not never:
-        return ()
-    more = f" and {len(never) - 5} more" if len(never) > 5 else ""
-    return (f"{', '.join(never[:5])}{more} of layout '{layout.name}' never visible: where they are is a guess",)
+    if never:
+        more = f" and {len(never) - 5} more" if len(never) > 5 else ""
+        notes.append(f"{', '.join(never[:5])}{more} of layout '{layout.name}' never visible: where they are is a guess")
+    return tuple(notes)
 
 
 def _blocks(frames: int) -> Iterator[slice]:
     return (slice(begin, begin + _BLOCK) for begin in range(0, frames, _BLOCK))
 
 
-def _spread(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Extent (F,) of the visible points."""
-    extent = np.zeros(len(W))
+def _rms(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Root mean square distance (F,) of the visible points to their mean."""
+    return np.sqrt((centre(W.astype(float), visible) ** 2).sum((1, 2)) / np.maximum(visible.sum(1), 1))
+
+
+def _on_one_line(W: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Whether the visible points of frames are on one line, or in one place, but for rounding (F,)."""
+    flat = np.zeros(len(W), bool)
     for rows in _blocks(len(W)):
-        seen = visible[rows, None]
-        reach = np.where(seen, W[rows], -np.inf).max(2) - np.where(seen, W[rows], np.inf).min(2)
-        extent[rows] = np.nan_to_num(reach, neginf=0.0).max(1)
-    return extent
+        X = centre(W[rows].astype(float), visible[rows])
+        across = np.linalg.eigvalsh(X @ X.transpose(0, 2, 1))[:, 0] / np.maximum(visible[rows].sum(1), 1)
+        flat[rows] = across <= (_ROUNDING * np.abs(W[rows]).max((1, 2))) ** 2
+    return flat

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from paul_ros.files import NpzError, read_npz, write_atomically
-from training.data import DataError, TrainingData
+from training.data import DataError, TrainingData, check_sizes
 from training.objective import Views, fit, paul_terms
 from training.recipe import Recipe
 from training.solver import centre
@@ -127,8 +127,10 @@ def reconstruct(
         progress: is told the share of the work that is done, 0 to 1.
 
     Raises:
+        DataError: with one scale for all, a frame would outweigh the others.
         TrainingError: see ``Trainer``.
     """
+    check_sizes(data, recipe.scale)
     if folder is None:
         with tempfile.TemporaryDirectory() as temporary:
             return reconstruct(data, recipe, Path(temporary), progress)
