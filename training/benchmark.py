@@ -12,11 +12,13 @@ import numpy as np
 from paul_ros.replay import versions
 from training.data import DataError
 from training.experiments import BAD_BASIN, Keeping, Outcome, Run, chosen, groups, perform, summary
-from training.pictures import legend_above, method_colour, new_figure, percent_axis, save_figure, titled
+from training.pictures import legend_above, method_look, new_figure, percent_axis, save_figure, titled
 from training.published import REMARK, SOURCE, published
 from training.truth import Sequence, load_sequence
 
 METHODS = ("paul", "adl", "adl_low_rank", "linear", "rigid")
+
+_RIVAL_MARKERS = {"CNS": "s", "PND": "^", "BMM": "v", "BMM-v2": "D", "Deep NRSfM": "*"}
 
 _STARTS = ("linear", "rigid")
 _TRAINING = ("start", "regression_steps", "steps")
@@ -162,7 +164,7 @@ def _published_lines(report: dict, name: str) -> list[str]:
 
 
 def write_picture(path: Path, report: dict) -> None:
-    """A dot a run, filled the chosen one, a bar at the median; black lines are the paper's PAUL, grey dots its rivals.
+    """A dot a run, filled the chosen one, a bar at the median; black lines are the paper's PAUL, grey marks its rivals.
 
     Raises ImportError without matplotlib, PictureError for an odd suffix.
     """
@@ -181,13 +183,13 @@ def write_picture(path: Path, report: dict) -> None:
     ax.set_xticks(range(len(names)), names)
     ax.set_xlim(-0.55, len(names) - 0.4)
     percent_axis(ax, "normalised error, flip per frame, %")
-    titled(ax, "Every run; filled: chosen without truth, bar: median")
+    titled(ax, "Every run; filled: chosen without truth, bar: median;\nblack line and grey marks: published")
     legend_above(figure, ax)
     save_figure(figure, path)
 
 
 def _draw_runs(ax: Any, x: float, half: float, rows: list[dict], method: str) -> None:
-    colour, name = method_colour(method), Path(method).stem
+    name, colour = method_look(method)
     errors = np.array([row["ne_flip_frame_percent"] for row in rows])
     face = [colour if row["chosen"] else "white" for row in rows]
     ax.hlines(np.median(errors), x - half, x + half, color=colour, linewidth=2.5, label=name)
@@ -196,9 +198,10 @@ def _draw_runs(ax: Any, x: float, half: float, rows: list[dict], method: str) ->
 
 
 def _draw_published(ax: Any, middle: int, figures: dict[str, float]) -> None:
-    if not figures:
-        return
-    others = [value for name, value in figures.items() if name != "PAUL"]
-    line = dict(color="black", linewidth=1, label="PAUL, published", zorder=1)
-    ax.hlines(figures["PAUL"], middle - 0.42, middle + 0.42, **line)
-    ax.scatter([middle + 0.44] * len(others), others, s=12, color="#9a9a9a", label="others, published")
+    for name, value in figures.items():
+        if name == "PAUL":
+            line = dict(color="black", linewidth=1, label="PAUL, published", zorder=1)
+            ax.hlines(value, middle - 0.42, middle + 0.42, **line)
+        else:
+            mark = dict(marker=_RIVAL_MARKERS[name], s=22, facecolors="none", edgecolors="#707070", linewidths=1)
+            ax.scatter(middle + 0.44, value, label=name, **mark)

@@ -44,7 +44,13 @@ def _draw_frames(axes: Any, compared: Comparison, predicted: np.ndarray, true: n
         row[0].text(-0.04, 0.5, name, rotation=90, va="center", ha="right", transform=row[0].transAxes, fontsize=10)
     bare(axes, np.stack([view(S) for _, view in views for S in (predicted, true)]))
     for ax, share, value in zip(axes[0], _SHARES, error):
-        name = "worst frame" if share == 1 else "median frame" if share == 0.5 else f"{share:.0%} of frames are better"
+        name = (
+            "worst frame"
+            if share == 1
+            else "median frame"
+            if share == 0.5
+            else f"{100 * share:g} % of frames are better"
+        )
         ax.set_title(f"{name}\nNE {value:.2f} %", fontsize=10)
 
 

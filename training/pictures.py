@@ -14,22 +14,28 @@ from paul_ros.files import write_atomically
 from paul_ros.report import PictureError
 
 COLOURS = ("#1f77d0", "#e4572e", "#2a9d50", "#f0a030", "#8458b3", "#444444", "#17a2b8", "#c2185b")
-METHOD_COLOURS = {
-    "paul": "#1f77d0",
-    "adl": "#e4572e",
-    "adl_low_rank": "#f0a030",
-    "linear": "#2a9d50",
-    "rigid": "#9a9a9a",
+_METHODS = {
+    "paul": ("PAUL", "#1f77d0"),
+    "adl": ("ADL", "#e4572e"),
+    "adl_low_rank": ("ADL + low rank", "#f0a030"),
+    "linear": ("linear", "#2a9d50"),
+    "rigid": ("rigid", "#9a9a9a"),
 }
 TRUTH_COLOUR = "#b8b8b8"
 ERROR_COLOUR = "#d62728"
 
+_WIDE = 5.0
+"""Errors that differ by more than this factor are drawn over decades."""
+
+_LEGEND_COLUMN = 1.45
+"""Inches of a name in a legend."""
+
 _YAW, _PITCH = np.radians(35.0), np.radians(-15.0)
 
 
-def method_colour(method: str) -> str:
-    """Of a method's lines and bars; recipes of the user's own share one."""
-    return METHOD_COLOURS.get(method, "#8458b3")
+def method_look(method: str) -> tuple[str, str]:
+    """A method's name for people and its colour; recipes of the user's own share one."""
+    return _METHODS.get(method, (Path(method).stem, "#8458b3"))
 
 
 def new_figure(width: float, height: float) -> Any:
@@ -67,36 +73,45 @@ def titled(ax: Any, title: str) -> None:
 
 
 def legend_above(figure: Any, ax: Any) -> None:
-    """The legend of a panel's lines in a row above the figure, each name once."""
+    """The legend of a panel's lines in rows above the figure, each name once."""
     handles, names = ax.get_legend_handles_labels()
     first = dict(zip(reversed(names), reversed(handles)))
     names = list(dict.fromkeys(names))
     if names:
-        place = dict(loc="outside upper center", ncols=min(len(names), 6), frameon=False, fontsize=10)
+        columns = min(len(names), int(figure.get_figwidth() / _LEGEND_COLUMN))
+        place = dict(loc="outside upper center", ncols=columns, frameon=False, fontsize=10)
         figure.legend([first[name] for name in names], names, **place)
 
 
 def percent_axis(ax: Any, label: str = "normalised error, %") -> None:
-    """Errors over decades, ticked with plain numbers."""
+    """Errors that have been drawn: over decades, ticked with plain numbers; where they differ little, a usual axis."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(FixedLocator(_ticks(*ax.get_ylim())))
+    low, high = ax.dataLim.intervaly
+    if high > _WIDE * low:
+        ax.set_yscale("log")
+        ax.yaxis.set_major_locator(FixedLocator(_ticks(*ax.get_ylim())))
+        ax.yaxis.set_minor_locator(NullLocator())
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_locator(NullLocator())
     ax.set_ylabel(label)
     ax.grid(axis="y", color="#ececec", zorder=0)
     ax.set_axisbelow(True)
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers between two limits, as many as can be read."""
-    for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7), np.arange(1, 10, 0.2)):
+    """Round numbers between two limits that are far apart, as many as can be read."""
+    for steps in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7)):
         ticks = [round(step * 10.0**power, 6) for power in range(-4, 5) for step in steps]
         inside = [tick for tick in ticks if low <= tick <= high]
         if len(inside) >= 4:
             break
-    return inside[:: 1 + len(inside) // 12]
+    return inside
+
+
+def middle_and_half(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Middle (2,) and half the side of a square that holds points (N,2) with a margin; NaN does not count."""
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    return (low + high) / 2, 0.54 * (high - low).max() or 1.0
 
 
 def turned_view(S: np.ndarray) -> np.ndarray:
@@ -125,11 +140,9 @@ def _draw_lines(ax: Any, shape: np.ndarray, edges: np.ndarray, colour: Any, widt
 
 
 def bare(axes: Any, shapes: np.ndarray) -> None:
-    """No axes around panels of shapes (...,2,P), and one scale for all."""
-    points = np.moveaxis(shapes, -2, -1).reshape(-1, 2)
-    middle = (points.min(0) + points.max(0)) / 2
-    half = 0.54 * np.ptp(points, axis=0).max() or 1.0
+    """No axes around panels of shapes (...,2,P), and one scale for all; points of NaN are not drawn."""
+    (x, y), half = middle_and_half(np.moveaxis(shapes, -2, -1).reshape(-1, 2))
     for ax in np.ravel(axes):
-        ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
+        ax.set(xlim=(x - half, x + half), ylim=(y + half, y - half))
         ax.set_aspect("equal")
         ax.set_axis_off()

@@ -9,12 +9,11 @@ import numpy as np
 
 from training import benchmark
 from training.experiments import Outcome, Run, groups
-from training.pictures import legend_above, method_colour, new_figure, titled
+from training.pictures import legend_above, method_look, new_figure, titled
 from training.studies.study import Study
 from training.truth import Sequence
 
 METHODS = ("paul", "adl", "adl_low_rank")
-_NAMES = {"paul": "PAUL", "adl": "ADL", "adl_low_rank": "ADL + low rank"}
 
 
 def runs(sequences: list[Sequence], seeds: int, values: tuple[str, ...], settings: tuple[str, ...]) -> list[Run]:
@@ -23,7 +22,7 @@ def runs(sequences: list[Sequence], seeds: int, values: tuple[str, ...], setting
 
 
 def draw(outcomes: list[Outcome], report: dict) -> Any:
-    """A bar a method at the median over runs, with its figure; runs as dots."""
+    """A bar a method at the median over runs, its figure at the foot; runs as dots."""
     names = list(dict.fromkeys(line["sequence"] for line in report["summary"]))
     methods = list(dict.fromkeys(line["method"] for line in report["summary"]))
     figure = new_figure(max(6.5, 1.5 + 1.6 * len(names)), 5)
@@ -33,18 +32,14 @@ def draw(outcomes: list[Outcome], report: dict) -> Any:
     for (name, method), some in series.items():
         x = names.index(name) - 0.4 + width * (methods.index(method) + 0.5)
         errors = np.array([outcome.ne_flip_frame_percent for outcome in some])
-        ax.bar(x, np.median(errors), 0.9 * width, color=method_colour(method), label=_NAMES.get(method, method))
+        label, colour = method_look(method)
+        ax.bar(x, np.median(errors), 0.9 * width, color=colour, label=label)
         ax.scatter(np.full(len(errors), x), errors, s=14, color="black", alpha=0.5, linewidths=0, zorder=3)
-        ax.annotate(
-            f"{np.median(errors):.2f}",
-            (x, errors.max()),
-            ha="center",
-            va="bottom",
-            fontsize=8,
-            xytext=(0, 3),
-            textcoords="offset points",
-        )
+        # At the foot, where no dot of a run can lie.
+        place = dict(xytext=(0, -3), textcoords="offset points", annotation_clip=False)
+        ax.annotate(f"{np.median(errors):.2f}", (x, 0), ha="center", va="top", fontsize=8, **place)
     ax.set_xticks(range(len(names)), names)
+    ax.tick_params(axis="x", length=0, pad=16)
     ax.set(ylabel="normalised error, flip per frame, %", ylim=(0, None))
     titled(ax, "Median over runs, and every run")
     legend_above(figure, ax)

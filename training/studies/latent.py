@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from training.experiments import Outcome, Run, chosen, groups, summary
-from training.pictures import new_figure
+from training.pictures import method_look, middle_and_half, new_figure
 from training.studies.study import Study
 from training.truth import Sequence
 
 METHODS = ("paul", "adl")
-_NAMES = {"paul": "PAUL", "adl": "ADL"}
 _SMOOTH, _RANDOM = "own cameras", "random cameras"
 _PAIRS = 20_000
 
@@ -92,17 +91,14 @@ def draw(outcomes: list[Outcome], report: dict) -> Any:
     axes = figure.subplots(len(methods), len(columns), squeeze=False)
     for (name, cameras, method), some in series.items():
         ax = axes[methods.index(method), columns.index((name, cameras))]
-        best = chosen(some)
-        codes = best.codes - best.codes.mean(0)
-        number = np.arange(len(codes))
-        shown = ax.scatter(*codes.T, c=number, cmap="plasma", s=9, linewidths=0)
-        half = 1.08 * np.abs(codes).max() or 1.0
-        ax.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], aspect="equal")
-        ax.text(0.02, 0.02, f"roughness {roughness(codes):.2f}", transform=ax.transAxes, fontsize=9, color="#444444")
-        if ax in axes[0]:
-            ax.set_title(f"{name}, {cameras}", fontsize=11, fontweight="bold")
+        codes = chosen(some).codes
+        shown = ax.scatter(*codes.T, c=np.arange(len(codes)), cmap="plasma", s=9, linewidths=0)
+        (x, y), half = middle_and_half(codes)
+        ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), xticks=[], yticks=[], aspect="equal")
+        head = f"{name}, {cameras}\n" if ax in axes[0] else ""
+        ax.set_title(f"{head}roughness {roughness(codes):.2f}", fontsize=10)
         if ax in axes[:, 0]:
-            ax.set_ylabel(_NAMES.get(method, method), fontsize=12, fontweight="bold")
+            ax.set_ylabel(method_look(method)[0], fontsize=12, fontweight="bold")
     bar = figure.colorbar(shown, ax=axes, shrink=0.6, pad=0.01, ticks=[0, len(codes) - 1])
     bar.ax.set_yticklabels(["first\nframe", "last\nframe"])
     return figure
