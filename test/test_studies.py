@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 
 from paul_ros import cli
-from paul_ros.model import load_model
+from paul_ros.model import load_model, save_model, weight_shapes
+from paul_ros.skeleton import anonymous_layout
 from training import reconstruction
+from training.categories import joint_layout
 from training.reconstruction import Reconstruction
+from training.studies import interpolation
 from training.studies.latent import roughness
 from training.studies.study import studies
 from training.truth import random_rotations
@@ -149,6 +152,62 @@ def test_interpolation_draws_the_line_between_two_codes(model_file, tmp_path, ca
     codes = model.encode(S[:, :2], np.ones((10, 17), bool))
     apart = np.linalg.norm(codes[:, None] - codes, axis=2)
     assert apart[tuple(other["frames"])] == apart.max()
+
+
+def random_model(path, layout):
+    """A model file of random weights."""
+    header = {
+        "layout": layout.to_dict(),
+        "bottleneck": 2,
+        "metres_per_unit": None,
+        "chirality": {"known": False, "source": "made by hand"},
+        "architecture": {
+            "encoder": {"kind": "residual", "width": 4, "blocks": 1},
+            "decoder": {"kind": "mlp", "hidden": [4]},
+        },
+    }
+    rng = np.random.default_rng(0)
+    sizes = weight_shapes(header, len(layout.names))
+    arrays = {name: rng.standard_normal(size) for name, size in sizes.items()}
+    save_model(path, header, {**arrays, "mean_shape": rng.standard_normal((3, len(layout.names)))})
+    return path
+
+
+@pytest.mark.parametrize("far_off", [0.0, 9.0])
+def test_interpolation_of_a_category_shows_its_own_points(tmp_path, files, far_off, monkeypatch):
+    """What the model has for points of the other category counts for nothing, and is not drawn."""
+    drawn = []
+    monkeypatch.setattr(interpolation, "save_figure", lambda figure, path: drawn.append(figure))
+    layout = joint_layout(["one", "other"], [anonymous_layout(POINTS, ((0, 1),)), anonymous_layout(5)])
+    path = random_model(tmp_path / "m.npz", layout)
+    model = load_model(path)
+    model.weights["decoder.1.bias"].reshape(3, -1)[:, POINTS:] += far_off
+    monkeypatch.setattr(interpolation, "load_model", lambda _: model)
+    interpolation.run(path, [Path(files[0])], tmp_path, (2, 5))
+    (line,) = json.loads((tmp_path / "interpolation.json").read_text())["rows"]
+    with np.load(files[0]) as archive:
+        W = np.pad(archive["W"], ((0, 0), (0, 0), (0, 5)))
+    shapes = model.shape(W[[2, 5]], np.arange(POINTS + 5)[None].repeat(2, 0) < POINTS)[:, :, :POINTS].astype(float)
+    shapes -= shapes.mean(2, keepdims=True)
+    size = np.linalg.norm(shapes, axis=(1, 2)).mean()
+    assert line["ends_apart_percent"] == pytest.approx(100 * np.linalg.norm(shapes[1] - shapes[0]) / size, rel=0.1)
+    axes = drawn[0].axes
+    assert [ax.get_title() for ax in axes] == [
+        *("one\nframe 2 as seen", "0", "0.125", "0.25", "0.375", "0.5", "0.625", "0.75", "0.875", "1"),
+        "one\nframe 5 as seen",
+    ]
+    for ax in axes:
+        points = np.ma.filled(ax.collections[-1].get_offsets(), np.nan)
+        assert np.isfinite(points).all(1).sum() == POINTS and len(ax.lines) == 1
+
+
+def test_interpolation_needs_no_truth_and_names_frames_that_do_not_count(tmp_path, model_file, capsys):
+    S = np.random.default_rng(0).standard_normal((4, 3, 17))
+    visible = np.ones((4, 17), bool)
+    visible[1, 2:] = False
+    np.savez(tmp_path / "seen.npz", W=S[:, :2], visible=visible)
+    study("interpolation", [str(tmp_path / "seen.npz")], tmp_path, "--model", str(model_file), "--frames", "1,2")
+    assert "seen.npz: 1 of the frames show too few points" in capsys.readouterr().err
 
 
 def test_interpolation_needs_no_torch(tmp_path):

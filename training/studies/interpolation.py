@@ -1,25 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes on the straight line between two codes of a finished model, as a strip. Needs no torch."""
+"""Shapes on the straight line between two codes of a finished model, as a strip. Needs no torch, and no truth."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from paul_ros.model import Model, load_model
+from paul_ros.model import Model, load_model, normalise
 from paul_ros.onp import onp
 from paul_ros.replay import versions
 from paul_ros.report import write_json
-from training.data import DataError
+from training.categories import among_categories
+from training.data import DataError, load_training_data
 from training.pictures import bare, between, draw_shape, new_figure, save_figure, turned_view
-from training.truth import Sequence, load_sequence
+from training.truth import Sequence
 
 ERRORS = (DataError,)
 """What a user can cause and mend; the text of each is one clear line."""
 
 _SHAPES = 9
+_DRAWN = ("shapes", "seen", "edges")
 _COMPARED = 500  # frames whose codes are compared for the farthest pair
 
 
@@ -33,14 +36,26 @@ def run(model_name: str | Path, files: list[Path], folder: Path, frames: tuple[i
         ModelError, DataError: a file that cannot be used, or does not have these frames.
     """
     model = load_model(model_name)
-    strips = [_strip(model, load_sequence(file), frames) for file in files]
-    lines = [{key: value for key, value in strip.items() if key not in ("shapes", "edges")} for strip in strips]
+    strips = [_strip(model, _views(file, model), frames) for file in files]
+    lines = [{key: value for key, value in strip.items() if key not in _DRAWN} for strip in strips]
     write_json(
         folder / "interpolation.json",
         {"study": "interpolation", "model": model.name, "rows": lines, "versions": versions()},
     )
     save_figure(_draw(model, strips), folder / "interpolation.png")
     return _table(lines)
+
+
+def _views(file: Path, model: Model) -> Sequence:
+    """What is seen in a file, of one category where it has the name of one; without truth."""
+    data = load_training_data(file)
+    if data.left_out:
+        print(
+            f"{file}: {data.left_out} of the frames show too few points; frame numbers leave them out", file=sys.stderr
+        )
+    unknown = np.full((len(data.W), 3, data.W.shape[2]), np.nan)
+    views = Sequence(Path(file).stem, data.W, data.visible, unknown, np.zeros((0, 2), int), metres=False)
+    return among_categories(views, model.layout)
 
 
 def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> dict:
@@ -50,19 +65,34 @@ def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> 
     if frames and max(frames) >= count:
         raise DataError(f"'{sequence.name}' has frames 0 to {count - 1}, not {max(frames)}: choose others")
     first, last = frames or _farthest(model, sequence)
-    ends = model.encode(sequence.W[[first, last]], sequence.visible[[first, last]]).astype(float)
+    W, visible = sequence.W[[first, last]].astype(float), sequence.visible[[first, last]]
+    ends = model.encode(W, visible).astype(float)
     share = np.linspace(0, 1, _SHAPES)[:, None]
     shapes = model.decode((1 - share) * ends[:1] + share * ends[1:]).astype(float)
-    pose = onp(shapes[:1], sequence.W[[first]], sequence.visible[[first]])
-    size = np.linalg.norm(shapes, axis=(1, 2)).mean()
+    pose = onp(shapes[:1], W[:1], visible[:1])
+    shapes[:, :, ~_own(model, sequence)] = np.nan
+    shapes = pose.R @ (shapes - np.nanmean(shapes, axis=2, keepdims=True))
+    size = _norm(shapes).mean()
     return {
         "data": sequence.name,
         "frames": [int(first), int(last)],
-        "changes_percent": (100 * np.linalg.norm(np.diff(shapes, axis=0), axis=(1, 2)) / size).tolist(),
-        "ends_apart_percent": float(100 * np.linalg.norm(shapes[-1] - shapes[0]) / size),
-        "edges": sequence.edges if len(sequence.edges) else np.array(model.layout.edges, int).reshape(-1, 2),
-        "shapes": pose.R @ shapes,
+        "changes_percent": (100 * _norm(np.diff(shapes, axis=0)) / size).tolist(),
+        "ends_apart_percent": float(100 * _norm(shapes[-1] - shapes[0]) / size),
+        "edges": np.array(model.layout.edges, int).reshape(-1, 2),
+        "shapes": shapes,
+        "seen": np.where(visible[:, None], normalise(W, visible), np.nan),
     }
+
+
+def _own(model: Model, sequence: Sequence) -> np.ndarray:
+    """(P,) bool: the points of the sequence's category; all, where it is none."""
+    points = range(len(model.layout.names))
+    return np.isin(points, model.layout.categories.get(sequence.name, points))
+
+
+def _norm(shapes: np.ndarray) -> np.ndarray:
+    """Of shapes (...,3,P), over the points that are there."""
+    return np.sqrt(np.nansum(shapes**2, axis=(-2, -1)))
 
 
 def _farthest(model: Model, sequence: Sequence) -> tuple[int, int]:
@@ -86,16 +116,22 @@ def _table(lines: list[dict]) -> str:
 
 
 def _draw(model: Model, strips: list[dict]) -> Any:
-    """A row a file, all shapes from the first frame's camera, turned a little; blue the first, red the last."""
-    figure = new_figure(1.55 * _SHAPES, 2.3 * len(strips) + 0.5)
+    """A row a file: what was seen in the first and the last frame, and between them all shapes; blue to red.
+
+    The shapes are those before the first frame's camera, turned a little.
+    """
+    figure = new_figure(1.55 * (_SHAPES + 2), 2.3 * len(strips) + 0.5)
     figure.suptitle(f"Between two codes of {model.name}", fontsize=12, fontweight="bold")
-    axes = figure.subplots(len(strips), _SHAPES, squeeze=False)
+    axes = figure.subplots(len(strips), _SHAPES + 2, squeeze=False)
     for row, strip in zip(axes, strips):
-        seen = turned_view(strip["shapes"] - strip["shapes"].mean(2, keepdims=True))
-        for place, (ax, shape) in enumerate(zip(row, seen)):
-            share = place / (_SHAPES - 1)
+        shares = np.linspace(0, 1, _SHAPES)
+        turned = turned_view(strip["shapes"])
+        for ax, share, shape in zip(row[1:-1], shares, turned):
             draw_shape(ax, shape, strip["edges"], between(share))
-            ends = {0: f"{strip['data']}\nframe {strip['frames'][0]}", _SHAPES - 1: f"frame {strip['frames'][1]}"}
-            ax.set_title(ends.get(place, f"{share:.3g}"), fontsize=9)
-        bare(row, seen)
+            ax.set_title(f"{share:.3g}", fontsize=9)
+        for ax, share, seen, number in zip(row[[0, -1]], (0.0, 1.0), strip["seen"], strip["frames"]):
+            draw_shape(ax, seen, strip["edges"], between(share))
+            ax.set_title(f"{strip['data']}\nframe {number} as seen", fontsize=9)
+        bare(row[1:-1], turned)
+        bare(row[[0, -1]], strip["seen"])
     return figure
