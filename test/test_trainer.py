@@ -15,6 +15,7 @@ from paul_ros.onp import onp
 from paul_ros.skeleton import load_layout
 from training import starting, trainer
 from training.encoder_fit import fit_encoder
+from training.objective import fit
 from training.recipe import Recipe, RecipeError
 from training.reconstruction import final_loss
 from training.trainer import Trainer, TrainingError, one_buffer, rule_share
@@ -31,6 +32,7 @@ TINY = {
 }
 FREE = {**TINY, "codes": "free", "scale": "unit"}
 STARTED = {**FREE, "start": "linear", "regression_steps": 6, "steps": 6}
+HELD = {**STARTED, "codes": "encoder", "hold": 2}
 
 
 @pytest.fixture(autouse=True)
@@ -68,11 +70,20 @@ def same_weights(a, b):
     return all(torch.equal(x, y) for x, y in zip(a.networks.parameters(), b.networks.parameters()))
 
 
-@pytest.mark.parametrize("step", [0, 3, 6, 9])
-@pytest.mark.parametrize("codes", ["free", "encoder"])
-def test_a_run_stopped_anywhere_continues_to_the_bit(tmp_path, searches, step, codes):
-    data, _, _ = sequence()
-    recipe = Recipe.from_dict({**STARTED, "codes": codes, "roll": 1.0, "hide": 0.3, "patience": 4})
+STOPS = [
+    *(
+        pytest.param({"codes": codes}, step, id=f"{codes}-{step}")
+        for codes in ("free", "encoder")
+        for step in (0, 3, 6, 9)
+    ),
+    *(pytest.param({**HELD, "generations": 2}, step, id=f"held-{step}") for step in (0, 3, 6, 9, 12, 15, 18, 21)),
+]
+
+
+@pytest.mark.parametrize("settings, step", STOPS)
+def test_a_run_stopped_anywhere_continues_to_the_bit(tmp_path, searches, step, settings):
+    data, _, _ = sequence(hidden=0.2)
+    recipe = Recipe.from_dict({**STARTED, **settings, "roll": 1.0, "hide": 0.3, "patience": 6})
     whole = through(Trainer(data, recipe, tmp_path / "whole"))
     first = Trainer(data, recipe, tmp_path / "parts")
     if step:
@@ -111,6 +122,44 @@ def test_the_networks_learn_the_starts_shapes(tmp_path, searches, codes, scale):
     assert rows[2]["recon_ad"] < 0.35 * first["recon_ad"] and rows[2]["recon_ae"] < 0.5 * first["recon_ae"]
 
 
+@pytest.mark.parametrize("scale", ["unit", "free"])
+def test_held_solutions_are_those_of_the_lower_level(tmp_path, searches, scale):
+    """A lesson's shapes explain the frames' own points, and are learned as cameras of other frames see them."""
+    data, _, _ = sequence(hidden=0.2)
+    run = until(Trainer(data, Recipe.from_dict({**HELD, "scale": scale, "steps": 5}), tmp_path), 9)
+    lesson = run._lesson
+    S = lesson.shapes_of(torch.arange(40), None).numpy()
+    assert onp(S, run.views(torch.arange(40)).W.numpy(), data.visible, scale).residual.max() < 1e-5
+    views, rows, goal, _ = run._batch(trainer.HELD)
+    assert onp(goal.numpy(), views.W.numpy(), views.visible.numpy(), scale).residual.max() < 1e-5
+    assert (views.W - run.views(rows).W).abs().max() > 0.1 and torch.equal(views.visible, run.views(rows).visible)
+
+
+def test_held_solutions_are_renewed_as_the_recipe_says(tmp_path, searches, monkeypatch):
+    renewed = []
+    made = Trainer._held
+    monkeypatch.setattr(Trainer, "_held", lambda run, phase: renewed.append(run.step) or made(run, phase))
+    run = through(Trainer(sequence()[0], Recipe.from_dict({**HELD, "steps": 5}), tmp_path))
+    assert renewed == [6, 8, 10]
+    assert [row[-1] for row in run.rows] == ["regression", "held"]
+
+
+def test_the_next_generation_starts_afresh_from_what_the_last_explained_best(tmp_path, searches):
+    data, _, _ = sequence(hidden=0.2)
+    first = through(Trainer(data, Recipe.from_dict(HELD), tmp_path / "first"))
+    run = until(Trainer(data, Recipe.from_dict({**HELD, "generations": 2}), tmp_path / "two"), 12)
+    assert same_weights(first, run) and run.steps == 24 and not run.finished
+    views = first.views(torch.arange(40))
+    with torch.no_grad():
+        found = fit(first.networks, first.recipe, views, torch.arange(40))
+    left = (found.streams.mean(0)[:, :2] - views.W).mul(views.visible[:, None]).flatten(1).norm(dim=1)
+    before = [weights.clone() for weights in run.networks.parameters()]
+    next(iter(run.run()))
+    assert sorted(left.argsort()[:36].tolist()) == run._lesson.rows.tolist()
+    moved = [(a - b).abs().max() for a, b in zip(before, run.networks.parameters())]
+    assert max(moved) > 0.1  # a step of Adam's would be a thousandth at most
+
+
 def test_a_start_is_of_the_chirality_that_the_layout_asks_for(tmp_path, monkeypatch):
     data, camera, R = sequence(layout=COCO)
     true = true_start(data, camera, R)
@@ -136,7 +185,7 @@ def test_a_mirrored_start_explains_the_same_views():
 def test_a_mirrored_object_has_a_mirrored_shape(tmp_path):
     """The shape to be learned for a view with left and right exchanged fits that view."""
     data, camera, R = sequence(layout=COCO)
-    lesson = starting.Lesson(true_start(data, camera, R), COCO, "unit", torch.device("cpu"))
+    lesson = starting.Lesson.of(true_start(data, camera, R), COCO, "unit", torch.device("cpu"))
     S = lesson.shapes_of(torch.arange(40), torch.ones(40, 1, 1, dtype=torch.bool)).numpy()
     W = (camera[:, :2] * [[-1], [1]])[:, :, COCO.mirror] / data.image_unit
     found = onp(S, W, data.visible, "unit")
@@ -151,7 +200,7 @@ def test_a_symmetric_object_mirrored_is_itself():
     start = starting.Start(
         np.arange(4), np.repeat(S[None], 4, 0).astype(np.float32), np.repeat(np.eye(3)[None], 4, 0), 0, 0
     )
-    lesson = starting.Lesson(start, COCO, "unit", torch.device("cpu"))
+    lesson = starting.Lesson.of(start, COCO, "unit", torch.device("cpu"))
     plain, mirrored = (lesson.shapes_of(torch.arange(4), flag.expand(4, 1, 1)) for flag in torch.tensor([False, True]))
     torch.testing.assert_close(plain, mirrored, rtol=0, atol=1e-5)
 
@@ -272,6 +321,9 @@ BAD = {
     "patience": ({"patience": -1}, "patience"),
     "nothing to do": ({"steps": 0}, "nothing is trained"),
     "start unused": ({"start": "linear"}, "regression_steps"),
+    "generations without hold": ({"generations": 2}, "give the recipe hold"),
+    "held free codes": ({**STARTED, "hold": 5}, "hold needs codes: encoder"),
+    "held random networks": ({"hold": 5}, "a start other than random"),
     "mirrored free codes": ({"codes": "free", "mirror_object": True}, "mirror_object needs codes: encoder"),
 }
 

@@ -27,9 +27,9 @@ CHOICES = {
     "streams": ("both", "decoder"),
     "start": ("random", "rigid", "linear"),
 }
-_POSITIVE = ("bottleneck", "width", "blocks", "learning_rate", "code_learning_rate", "restarts")
+_POSITIVE = ("bottleneck", "width", "blocks", "learning_rate", "code_learning_rate", "restarts", "generations")
 _NOT_NEGATIVE = (
-    *("steps", "regression_steps", "batch", "patience", "roll"),
+    *("steps", "regression_steps", "hold", "batch", "patience", "roll"),
     *("code_weight", "decay_weight", "nuclear_weight", "handedness_weight", "bone_weight"),
 )
 
@@ -54,6 +54,10 @@ class Recipe:
     start: str = "random"  # weights, as in the paper; rigid or linear: shapes that the networks first learn to give
     regression_steps: int = 0  # that they learn them for
     steps: int = 20_000  # of the objective; 0: the shapes of the start are the result
+    hold: int = 0  # steps that the lower level's solutions of all frames are held for, while the networks learn them as
+    # the cameras of other frames see them (beyond the paper); 0: solved anew for every batch, as the paper does
+    generations: int = 1  # of networks; each but the first starts from what the last one made of the frames, less the
+    # tenth that it explained worst: most frames that show the wrong mirror image are among those
     batch: int = 256  # 0: all frames at every step
     learning_rate: float = 1e-3  # Adam, warmed up over 200 steps, then a cosine to zero, in either phase
     code_learning_rate: float = 1e-2  # of free codes, which each frame has to itself
@@ -120,6 +124,13 @@ class Recipe:
         """Refuse settings that are sound alone and not together."""
         if self.codes == "free" and self.mirror_object:
             raise RecipeError("mirror_object needs codes: encoder, for the mirrored object has another code")
+        if self.hold and (self.codes == "free" or self.start == "random"):
+            raise RecipeError(
+                "hold needs codes: encoder, for a free code sees no other views, and a start other than random, for "
+                "what random networks make of the frames teaches nothing"
+            )
+        if self.generations > 1 and not self.hold:
+            raise RecipeError("generations hand on solutions that are held: give the recipe hold, as 1000 steps")
         if self.start == "random" and not self.steps:
             raise RecipeError("with start: random and steps: 0 nothing is trained: choose start: linear, or some steps")
         if self.start != "random" and self.steps and not self.regression_steps:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from paul_ros.files import write_atomically
+from paul_ros.files import read_npz, write_atomically
 from paul_ros.metrics import procrustes
 from paul_ros.skeleton import Layout
 from training.data import TrainingData
@@ -103,15 +103,14 @@ def _packed(start: Start, identity: dict) -> bytes:
 
 def _unpacked(data: bytes, identity: dict, path: Path) -> Start:
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            found = json.loads(str(archive["identity"]))
-            rows, shapes, rotations = archive["rows"], archive["shapes"], archive["rotations"]
-            start = Start(rows, shapes, rotations, float(archive["score"]), float(archive["seconds"]))
-    except Exception as error:  # numpy and zipfile report damage in a dozen ways
+        kept = read_npz(io.BytesIO(data), ("identity", "rows", "shapes", "rotations", "score", "seconds"))
+        found = json.loads(str(kept["identity"]))
+        start = Start(kept["rows"], kept["shapes"], kept["rotations"], float(kept["score"]), float(kept["seconds"]))
+    except (TypeError, ValueError) as error:  # an NpzError is a ValueError
         raise StartError(f"'{path}' cannot be read ({type(error).__name__}): start over with --fresh") from error
     other = [name for name in identity if found.get(name) != identity[name]]
     if other:
-        raise StartError(f"'{path}' belongs to another {' and '.join(other)}: start over with --fresh")
+        raise StartError(f"'{path}' belongs to a run with different {' and '.join(other)}: start over with --fresh")
     return start
 
 
@@ -130,16 +129,35 @@ def symmetry(shapes: np.ndarray, layout: Layout) -> np.ndarray:
 
 
 class Lesson:
-    """Canonical shapes of a start that the networks learn to give."""
+    """Canonical shapes that the networks learn to give: a start's, or what they themselves last made of all frames.
 
-    def __init__(self, start: Start, layout: Layout, scale: str, device: torch.device) -> None:
-        shapes = torch.from_numpy(start.shapes).to(device)
+    Args:
+        shapes: (n,3,P) float32 in one canonical frame, of any scale.
+        rotations: (n,3,3) float32, the cameras that saw them.
+        rows: (n,) the frames' numbers.
+    """
+
+    def __init__(self, shapes: Tensor, rotations: Tensor, rows: Tensor, layout: Layout, scale: str) -> None:
         self._shapes = to_unit_size(shapes, layout) if scale == "free" else to_centre(shapes, layout)
-        self._symmetry = torch.from_numpy(symmetry(start.shapes, layout)).to(device)
+        self._cameras = rotations[:, :2]
+        self._symmetry = torch.from_numpy(symmetry(shapes.cpu().numpy(), layout)).to(shapes)
         self._mirror = list(layout.mirror)
-        self.rows = torch.from_numpy(start.rows)
+        self.rows = rows
+
+    @classmethod
+    def of(cls, start: Start, layout: Layout, scale: str, device: torch.device) -> Lesson:
+        """What a start teaches."""
+        shapes, rotations = (torch.from_numpy(array).to(device) for array in (start.shapes, start.rotations))
+        return cls(shapes, rotations, torch.from_numpy(start.rows), layout, scale)
 
     def shapes_of(self, chosen: Tensor, exchanged: Tensor | None) -> Tensor:
-        """Shapes (N,3,P) by their places in the start (N,), mirrored where left and right are exchanged (N,1,1)."""
+        """Shapes (N,3,P) by their places in the lesson (N,), mirrored where left and right are exchanged (N,1,1)."""
         S = self._shapes[chosen.to(self._shapes.device)]
         return S if exchanged is None else torch.where(exchanged, self._symmetry @ S[:, :, self._mirror], S)
+
+    def seen_by(self, cameras: Tensor, S: Tensor) -> Tensor:
+        """Orthographic views (N,2,P) of shapes S (N,3,P) by the cameras of other frames, by places in the lesson (N,).
+
+        An exact augmentation: the shape is the same from wherever it is seen, and cameras are those that do occur.
+        """
+        return self._cameras[cameras.to(S.device)] @ S

@@ -2,7 +2,8 @@
 """The training loop: batches of 2D frames in, a checkpoint and a log out; resumable to the bit.
 
 A run has up to three parts: a start is found (``starting.py``), the networks learn to give its shapes, and then the
-paper's objective is minimised.
+paper's objective is minimised: over both levels at once, or over one while the other is held (``Recipe.hold``), in
+which case fresh networks may then do it all again, starting from what the first made of the frames.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from training import starting
 from training.data import TrainingData
 from training.distributed import Share, from_first, is_first, processes, share_of
 from training.networks import Paul, build_networks, main_axes
-from training.objective import Terms, Views, paul_terms, regression_terms
+from training.objective import Terms, Views, fit, paul_terms, regression_terms
 from training.recipe import Recipe
 from training.starting import START_UNIT, Lesson, Progress, Start, StartError, kept_start, start_identity
 
@@ -37,7 +38,9 @@ LOG_COLUMNS = (
     *("step", "seconds", "loss", "recon_ae", "recon_ad", "code", "handedness", "bones", "nuclear"),
     *("learning_rate", "phase"),
 )
-REGRESSION, UNSUPERVISED = "regression", "unsupervised"
+REGRESSION, UNSUPERVISED, HELD = "regression", "unsupervised", "held"
+_HELD_BATCH = 1000  # frames whose lower level is solved at once
+_LEFT_OUT = 0.1  # of the frames: the least explained, which do not teach the next generation
 _AXES_VIEWS = 1000  # evenly chosen frames that main axes are found from
 _LOG_EVERY = 100
 _CHECKPOINT_SECONDS = 30.0
@@ -104,17 +107,24 @@ class Trainer:
         self._visible = torch.from_numpy(data.visible).to(self.device)
         self._mirror = torch.tensor(data.layout.mirror, device=self.device)
         self.generator = torch.Generator().manual_seed(recipe.seed)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(recipe.seed)
-            self.networks = build_networks(data.layout, recipe, len(data.W), self._axes()).to(self.device)
+        self.step, self.seconds, self.rows = 0, 0.0, []
+        self.networks = self._fresh_networks()
         self.optimizer = self._optimizer()
         self._objective: nn.Module = _Objective(self.networks, data.layout, recipe)
         if processes() > 1:
             self._objective = nn.parallel.DistributedDataParallel(self._objective)
         self.start: Start | None = None
-        self.step, self.seconds, self.rows = 0, 0.0, []
+        self._lesson: Lesson | None = None
+        self._teacher: dict[str, Tensor] | None = None  # weights of the networks whose solutions are held
         self.stopped = False
         self._window = [0, 0.0, math.inf]  # steps and losses since the last look at them, and the mean before it
+
+    def _fresh_networks(self) -> Paul:
+        """With the weights that the recipe's seed gives the generation that begins."""
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.recipe.seed + self.step)
+            networks = build_networks(self.data.layout, self.recipe, len(self.data.W), self._axes())
+        return networks.to(self.device)
 
     def _axes(self) -> Tensor | None:
         """What h brings views upright by, if the recipe asks for it."""
@@ -136,8 +146,18 @@ class Trainer:
 
     @property
     def steps(self) -> int:
-        """Steps of both phases."""
+        """Steps of both phases, of all generations."""
+        return self.recipe.generations * self._steps_each
+
+    @property
+    def _steps_each(self) -> int:
+        """Steps of one generation."""
         return self.regression_steps + self.recipe.steps
+
+    @property
+    def _own_step(self) -> int:
+        """Steps that this generation has done."""
+        return self.step % self._steps_each
 
     @property
     def finished(self) -> bool:
@@ -161,6 +181,7 @@ class Trainer:
             self.generator.set_state(state["generator"].cpu())
             self.step, self.seconds, self.rows = state["step"], state["seconds"], [tuple(row) for row in state["rows"]]
             self.stopped, self._window = state["stopped"], list(state["window"])
+            self._teacher = state["teacher"]
         except TrainingError:
             raise
         except Exception as error:  # torch reports damage in many ways
@@ -187,7 +208,7 @@ class Trainer:
         if self.step == 0:
             self.seconds = start.seconds
         if self.regression_steps:
-            self._lesson = Lesson(self.start, self.data.layout, self.recipe.scale, self.device)
+            self._lesson = Lesson.of(self.start, self.data.layout, self.recipe.scale, self.device)
 
     def run(self) -> Iterator[dict[str, float | str]]:
         """Train to the recipe's last step, yielding the log row of every step's progress.
@@ -198,6 +219,8 @@ class Trainer:
             TrainingError: the loss became infinite or NaN.
         """
         self.prepare()
+        if self._teacher is not None:
+            self._lesson = self._held_again()
         saved, begun = time.monotonic(), time.monotonic() - self.seconds
         try:
             while not self.finished:
@@ -226,6 +249,7 @@ class Trainer:
                 "rows": [list(row) for row in self.rows],
                 "stopped": self.stopped,
                 "window": self._window,
+                "teacher": self._teacher,
             },
             buffer,
         )
@@ -265,7 +289,12 @@ class Trainer:
 
     def _advance(self, begun: float) -> dict[str, float | str]:
         """One optimisation step."""
-        phase = REGRESSION if self.step < self.regression_steps else UNSUPERVISED
+        phase = self._phase()
+        if self._lesson_is_over(phase):
+            self._teacher = {name: weights.clone() for name, weights in self.networks.state_dict().items()}
+            self._lesson = self._held(phase)
+            if phase == REGRESSION:
+                self._forget()
         factor = self._rate_factor()
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * factor
@@ -285,12 +314,55 @@ class Trainer:
         self.optimizer.step()
         self.step += 1
         self.seconds = time.monotonic() - begun
-        if phase == UNSUPERVISED and self.recipe.patience:
+        if phase != REGRESSION and self.recipe.patience:
             self.stopped = self._settled(loss)
         row = self._row(terms, self.recipe.learning_rate * factor, phase)
-        if self.step % _LOG_EVERY == 0 or self.step == self.regression_steps or self.finished:
+        if self.step % _LOG_EVERY == 0 or self._own_step in (0, self.regression_steps) or self.finished:
             self.rows.append(row)
         return dict(zip(LOG_COLUMNS, row))
+
+    def _phase(self) -> str:
+        """Of the step to come."""
+        if self._own_step < self.regression_steps:
+            return REGRESSION
+        return HELD if self.recipe.hold else UNSUPERVISED
+
+    def _lesson_is_over(self, phase: str) -> bool:
+        """Whether the next step is the first one after the lesson: a generation's first, or when a hold ends."""
+        if phase == REGRESSION:
+            return self.step > 0 and self._own_step == 0
+        return phase == HELD and (self._own_step - self.regression_steps) % self.recipe.hold == 0
+
+    @torch.no_grad()
+    def _held(self, phase: str) -> Lesson:
+        """What the networks make of all frames, R^T [W; z] of equations 8-10 and 14, to be learned for a while.
+
+        Where it is for the next generation to begin with, the frames that are explained worst are left out.
+        """
+        shapes, cameras, errors = [], [], []
+        for rows in torch.arange(len(self.data.W)).split(_HELD_BATCH):
+            found = fit(self.networks, self.recipe, self.views(rows), rows.to(self.device))
+            shapes.append(found.camera.R.mT @ found.points)
+            cameras.append(found.camera.R)
+            errors.append((found.streams.mean(0) - found.points).flatten(1).norm(dim=1))
+        left_out = int(_LEFT_OUT * len(self.data.W)) if phase == REGRESSION else 0
+        rows = torch.cat(errors).argsort()[: len(self.data.W) - left_out].sort().values
+        shapes, cameras = torch.cat(shapes)[rows], torch.cat(cameras)[rows]
+        return Lesson(shapes, cameras, rows.cpu(), self.data.layout, self.recipe.scale)
+
+    def _held_again(self) -> Lesson:
+        """The lesson of an interrupted run, from the weights that made it."""
+        weights = {name: values.clone() for name, values in self.networks.state_dict().items()}
+        self.networks.load_state_dict(self._teacher)
+        lesson = self._held(self._phase())
+        self.networks.load_state_dict(weights)
+        return lesson
+
+    def _forget(self) -> None:
+        """Give the networks fresh weights, in place: the next generation's."""
+        fresh = self._fresh_networks()
+        self.networks.load_state_dict(fresh.state_dict())
+        self.optimizer.state.clear()
 
     def _row(self, terms: Terms, rate: float, phase: str) -> tuple:
         values = (getattr(terms, name) for name in LOG_COLUMNS[2:9])
@@ -312,8 +384,8 @@ class Trainer:
 
     def _rate_factor(self) -> float:
         """Of all learning rates: a warm-up and a cosine to zero in either phase."""
-        first = self.step < self.regression_steps
-        step = self.step if first else self.step - self.regression_steps
+        first = self._own_step < self.regression_steps
+        step = self._own_step if first else self._own_step - self.regression_steps
         steps = self.regression_steps if first else self.recipe.steps
         warm_up = min(1.0, (step + 1) / _WARM_UP_STEPS)
         return float(warm_up * 0.5 * (1 + np.cos(np.pi * step / steps)))
@@ -322,7 +394,8 @@ class Trainer:
         """This process's share of a batch: views, frame numbers, and in the first phase the shapes to be learned.
 
         Every view is seen anew, turned, mirrored and with more points hidden. None of that changes the canonical shape,
-        but for a mirrored object, whose shape is mirrored as well.
+        but for a mirrored object, whose shape is mirrored as well.  Where the lower level is held, shapes are seen by
+        other frames' cameras, not their own: a frame whose depth is wrong then does not go on to teach it to itself.
         """
         recipe = self.recipe
         pool = len(self.data.W) if phase == UNSUPERVISED else len(self._lesson.rows)
@@ -335,6 +408,10 @@ class Trainer:
             exchanged = (self._uniform(size) < 0.5)[:, None, None]
             W = torch.where(exchanged, W[:, :, self._mirror] * torch.tensor([[-1.0], [1.0]], device=self.device), W)
             visible = torch.where(exchanged[:, 0], visible[:, self._mirror], visible)
+        goal = None if phase == UNSUPERVISED else self._lesson.shapes_of(chosen, exchanged)
+        if recipe.hold:
+            others = torch.randint(pool, (size,), generator=self.generator)
+            W = self.data.image_unit * self._lesson.seen_by(others, goal)
         if recipe.hide:
             fewer = visible & (self._uniform(size, visible.shape[1]) >= recipe.hide * self._uniform(size, 1))
             visible = torch.where(enough_visible(fewer, self.data.layout)[:, None], fewer, visible)
@@ -343,7 +420,7 @@ class Trainer:
             turn, facing = self._turns(size)
             W = turn @ W
         share = share_of(size)
-        goal = None if phase == UNSUPERVISED else self._lesson.shapes_of(chosen, exchanged)[share.part]
+        goal = None if goal is None else goal[share.part]
         return self._seen(W, visible, facing)[share.part], rows[share.part], goal, share
 
     def _turns(self, size: int) -> tuple[Tensor, Tensor]:
@@ -359,7 +436,7 @@ class Trainer:
     def _strength(self) -> float:
         """Of the view augmentations: 1 before the fade, 0 after it."""
         begin, end = self.recipe.fade
-        done = max(0, self.step - self.regression_steps) / max(1, self.recipe.steps)
+        done = max(0, self._own_step - self.regression_steps) / max(1, self.recipe.steps)
         if done < begin:
             return 1.0
         return (end - done) / (end - begin) if done < end else 0.0
@@ -380,7 +457,7 @@ class Trainer:
         other = [name for name, value in self._identity().items() if identity.get(name) != value]
         if other:
             raise TrainingError(
-                f"'{self.folder}' holds a run with another {' and '.join(other)}: "
+                f"'{self.folder}' holds a run with different {' and '.join(other)}: "
                 f"start over with --fresh, or choose another output"
             )
 
