@@ -561,8 +561,8 @@ def _run(argv: list[str]) -> int:
     try:
         args = _parser(train).parse_args(argv)
         args.run(args)
-    except KeyboardInterrupt:
-        print("paul: stopped", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"paul: {str(stop) or 'stopped'}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         raise

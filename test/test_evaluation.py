@@ -364,3 +364,13 @@ def test_a_reconstruction_of_other_frames_is_refused(tmp_path, capsys):
     assert "that was reconstructed" in capsys.readouterr().err
     assert cli.main(["evaluate", str(data), "--truth", str(data)]) == 1
     assert "no saved reconstruction" in capsys.readouterr().err
+
+
+def test_either_form_names_the_other(model_file, tmp_path, capsys):
+    data = write(tmp_path / "d.npz", sequence().S)
+    assert cli.main(["evaluate", saved(tmp_path / "s.npz", sequence().S), str(data)]) == 1
+    assert "holds saved shapes, no model: name their data with --truth" in capsys.readouterr().err
+    assert cli.main(["evaluate", str(model_file), "--truth", str(data)]) == 1
+    assert "a model is judged without --truth: MODEL DATA" in capsys.readouterr().err
+    assert cli.main(["evaluate", "humen", str(data)]) == 1
+    assert "--truth" not in capsys.readouterr().err

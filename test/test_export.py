@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a finished run becomes: sizes, mirror images and memory of the model file."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from paul_ros.model import load_model
+from paul_ros.skeleton import anonymous_layout, load_layout
 from training import export
+from training.categories import joint_layout
 from training.data import load_training_data
 from training.export import export_model, same_side_share
 from training.recipe import Recipe
@@ -40,7 +44,7 @@ def trained(data, folder, **settings):
 @pytest.mark.parametrize("encoder, upright", [("residual", False), ("residual", True), ("convolutional", False)])
 def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, encoder, upright):
     trainer = trained(data, tmp_path, scale=scale, encoder=encoder, upright=upright)
-    header = export_model(trainer, tmp_path / "m.npz", "paul train")
+    header = export_model(trainer, 0.5, tmp_path / "m.npz", "paul train")
     model = load_model(tmp_path / "m.npz")
     assert model.scale == scale and ("image_unit" in header) == (scale == "unit")
     assert header["chirality"]["known"] is False and 0 <= header["chirality"]["same_side_share"] <= 1
@@ -55,9 +59,38 @@ def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, enco
     assert (np.ptp(sizes) > 1e-3) == (scale == "unit")
 
 
+def test_weights_come_from_whatever_device_they_are_on():
+    class OnGpu:
+        def numpy(self):
+            raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+        def cpu(self):
+            return torch.ones(2)
+
+    networks = SimpleNamespace(state_dict=lambda: {"encoder.0.weight": OnGpu(), "shape_encoder.0.weight": OnGpu()})
+    (weights,) = export._weights(SimpleNamespace(networks=networks)).items()
+    assert weights[0] == "encoder.0.weight" and isinstance(weights[1], np.ndarray)
+
+
+def test_the_final_loss_is_the_one_that_ranked_the_run(data, tmp_path):
+    header = export_model(trained(data, tmp_path), 0.123456, tmp_path / "m.npz", "paul train")
+    assert header["training"]["final"] == {"loss": 0.12346}
+
+
+def test_chirality_is_known_only_if_every_category_has_a_rule():
+    coco = load_layout("coco17")
+    shapes = np.repeat(load_model().mean_shape[None].astype(float), 3, axis=0)
+    assert export._chirality(shapes, shapes[0], coco, 1.0)["known"]
+    both = np.concatenate([shapes, shapes], axis=2)
+    assert export._chirality(both, both[0], joint_layout(["a", "b"], [coco, coco]), 1.0)["known"]
+    box = np.concatenate([shapes, shapes[:, :, :4]], axis=2)
+    found = export._chirality(box, box[0], joint_layout(["person", "box"], [coco, anonymous_layout(4)]), 1.0)
+    assert not found["known"] and found["source"].endswith("no rule for box")
+
+
 def test_free_codes_and_the_shape_encoder_stay_behind(data, tmp_path):
     trainer = trained(data, tmp_path, codes="free")
-    export_model(trainer, tmp_path / "m.npz", "paul train")
+    export_model(trainer, 0.5, tmp_path / "m.npz", "paul train")
     names = load_model(tmp_path / "m.npz").weights
     assert not [name for name in names if not name.startswith(("encoder.", "decoder."))]
 
@@ -66,9 +99,9 @@ def test_the_mean_of_dense_shapes_is_taken_of_fewer(data, tmp_path, monkeypatch)
     trainer = trained(data, tmp_path)
     asked = []
     monkeypatch.setattr(export, "predict_shapes", lambda *args: asked.append(args[2]) or np.ones((4, 3, 11)))
-    export_model(trainer, tmp_path / "m.npz", "paul train")
+    export_model(trainer, 0.5, tmp_path / "m.npz", "paul train")
     monkeypatch.setattr(export, "_COORDINATES", 330)
-    export_model(trainer, tmp_path / "m.npz", "paul train")
+    export_model(trainer, 0.5, tmp_path / "m.npz", "paul train")
     assert asked == [4096, 10]
 
 

@@ -11,6 +11,7 @@ import torch
 from test_training import train
 from tiny_data import centred, sequence, true_start
 
+from paul_ros import cli as paul
 from paul_ros.bag import BagError
 from paul_ros.metrics import normalised_error
 from paul_ros.model import load_model
@@ -184,7 +185,7 @@ def test_what_is_no_reconstruction_is_refused(tmp_path, case):
 
 @pytest.fixture
 def file(tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "fit_encoder", lambda run: fit_encoder(run, 20))  # it is long
+    monkeypatch.setattr(cli, "fit_encoder", lambda run, progress: fit_encoder(run, 20, progress))  # it is long
     data, camera, _ = sequence()
     np.savez(tmp_path / "seq.npz", W=data.W, S=camera)
     return tmp_path / "seq.npz"
@@ -265,7 +266,7 @@ def test_tensorboard_gets_the_losses(file, tmp_path, monkeypatch):
     assert [step for _, step in curve] == [20, 40] and curve[1][0] < curve[0][0]
 
 
-def test_ctrl_c_says_how_to_go_on(file, tmp_path, monkeypatch):
+def test_ctrl_c_says_how_to_go_on(file, tmp_path, monkeypatch, capsys):
     advance = Trainer._advance
 
     def interrupted(self, begun):
@@ -274,6 +275,69 @@ def test_ctrl_c_says_how_to_go_on(file, tmp_path, monkeypatch):
         return advance(self, begun)
 
     monkeypatch.setattr(Trainer, "_advance", interrupted)
-    with pytest.raises(TrainingError, match="step 3 of 5: the same command continues"):
-        train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--set", "steps=5", "--quiet")
+    assert stopped(
+        capsys, file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--set", "start=random", "--set", "steps=5"
+    ) == ("paul: stopped at step 3 of 5: the same command continues")
     assert (tmp_path / "m.run" / "checkpoint.pt").exists()
+
+
+def stopped(capsys, *words):
+    """The last line of `paul train` that Ctrl-C ended, its exit code checked."""
+    assert paul.main(["train", *map(str, words), "--set", "regression_steps=0", "--quiet"]) == 130
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def interrupt(*words, **names):
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_during_the_search_or_the_last_fit_says_so(file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(starting, "search", interrupt)
+    words = [file, "--shapes", tmp_path / "s.npz", *AS_OPTIONS]
+    said = stopped(capsys, *words, "--set", "start=linear", "--set", "steps=0")
+    assert said == "paul: stopped while searching for a start: the same command begins again"
+    monkeypatch.setattr(cli, "fit_encoder", interrupt)
+    said = stopped(capsys, *words, "--fresh", "-o", tmp_path / "m.npz", "--set", "start=random", "--set", "steps=2")
+    assert "stopped while fitting the 2D encoder to the codes" in said
+    assert load_reconstruction(tmp_path / "s.npz").shapes.shape == (40, 3, 9)
+
+
+def test_a_restart_that_diverges_is_ranked_last(file, tmp_path, monkeypatch, capsys):
+    advance, bad = Trainer._advance, {0}
+
+    def diverging(self, begun):
+        if self.recipe.seed in bad and self.step == 2:
+            raise TrainingError("the loss is nan")
+        return advance(self, begun)
+
+    monkeypatch.setattr(Trainer, "_advance", diverging)
+    words = [*AS_OPTIONS, "--set", "steps=3", "--set", "restarts=2", "--quiet"]
+    train(file, "--shapes", tmp_path / "s.npz", *words, "--json", tmp_path / "r.json")
+    assert "seed 0  diverged" in capsys.readouterr().out
+    good, lost = json.loads((tmp_path / "r.json").read_text())["restarts"]
+    assert (good["seed"], good["chosen"], lost["seed"], lost["loss"]) == (1, True, 0, None)
+    bad.add(1)
+    with pytest.raises(TrainingError, match="the loss is nan"):
+        train(file, "--shapes", tmp_path / "t.npz", *words)
+
+
+def test_a_start_that_cannot_be_read_is_no_divergence(tmp_path, monkeypatch):
+    (tmp_path / "seed_0").mkdir()
+    (tmp_path / "seed_0" / "start.npz").write_bytes(b"junk")
+    given = sequence()
+    monkeypatch.setattr(starting, "search", search_for(*given))
+    with pytest.raises(TrainingError, match="start over"):
+        reconstruct(given[0], Recipe.from_dict({**STARTED, "restarts": 2}), tmp_path)
+
+
+def test_what_is_printed_of_losses_and_fits_has_its_name_and_unit(file, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(starting, "search", search_for(*sequence()))
+    words = [file, "--shapes", tmp_path / "s.npz", *AS_OPTIONS]
+    train(*words, "--set", "start=linear", "--set", "steps=0")
+    said = capsys.readouterr()
+    assert "score of the start 0 (negative log likelihood a frame" in said.out and "0step" not in said.err
+    train(*words, "-o", tmp_path / "m.npz", "--set", "steps=4", "--json", tmp_path / "m.json")
+    said, header = capsys.readouterr(), json.loads((tmp_path / "m.json").read_text())
+    assert "2D encoder: 100%" in said.err and "% of their size off theirs" in said.err
+    assert header["training"]["final"]["loss"] == pytest.approx(header["restarts"][0]["loss"], abs=1e-5)
+    assert said.out.count(f"final loss {header['restarts'][0]['loss']:.5f}") == 2

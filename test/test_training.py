@@ -264,6 +264,17 @@ def test_lengths_that_are_none_are_refused_before_training(data_file, tmp_path, 
         train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", f"known_lengths=[{length}]")
 
 
+def test_a_recipe_of_other_points_is_named(tmp_path):
+    np.savez(tmp_path / "hand.npz", W=views()[0][:, :, :9])
+    with pytest.raises(RecipeError, match="recipe human is for layouts with the points that it names: known_lengths"):
+        train(tmp_path / "hand.npz", "-o", tmp_path / "m.npz", "--recipe", "human", *SMALL)
+
+
+def test_no_threads_are_refused(data_file, tmp_path):
+    with pytest.raises(TrainingError, match="--threads must be at least 1, it is 0"):
+        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--threads", "0")
+
+
 def test_fresh_deletes_nothing_but_the_run(data_file, tmp_path):
     train(data_file, "-o", tmp_path / "m.npz", *SMALL)
     (tmp_path / "m.run" / "notes.txt").write_text("precious")
@@ -342,7 +353,7 @@ def test_a_bag_is_learned_from_and_lifted_with(tmp_path):
 
 
 def test_a_bag_in_another_layout_says_which_would_fit(tmp_path):
-    with pytest.raises(DataError, match="no 2D keypoints of layout 'body25'.*17 keypoints"):
+    with pytest.raises(DataError, match="no 2D keypoints of layout 'body25'.* refused on /keypoints: 17 keypoints"):
         load_training_data(BAG, load_layout("body25"))
 
 

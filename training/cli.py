@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import math
 import os
 import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +29,7 @@ from training.encoder_fit import fit_encoder
 from training.export import architecture, export_model
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.reconstruction import Run, reconstruction_of, restarts, run_folder, train_restarts
-from training.starting import START
+from training.starting import START, Progress
 from training.tensorboard import FOLDER as BOARD
 from training.tensorboard import Board, need_tensorboard
 from training.trainer import CHECKPOINT, LOG, Trainer, TrainingError
@@ -50,6 +53,34 @@ Stopped at any time, the same command continues it, to the bit. Several processe
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.epilog, parser.formatter_class = _EXAMPLES, argparse.RawDescriptionHelpFormatter
+    _add_data(parser)
+    parser.add_argument(
+        "--recipe", default="default", help=f"one of {', '.join(recipe_names())}, or a YAML file (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe"
+    )
+    parser.add_argument("--fresh", action="store_true", help="start over instead of continuing the run beside MODEL")
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="where the networks train; auto: on a GPU if torch finds one (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="CPU threads; the networks are small: more gain little, and lose much on a busy machine (default: 1)",
+    )
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
+    parser.add_argument("--tensorboard", action="store_true", help="write logs for TensorBoard beside the checkpoint")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _add_data(parser: argparse.ArgumentParser) -> None:
+    """What is read and what is written."""
     parser.add_argument(
         "data",
         metavar="DATA",
@@ -77,40 +108,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="C",
         help="keypoints of a bag below it count as hidden, as in the node (default: %(default)s)",
     )
-    parser.add_argument(
-        "--recipe", default="default", help=f"one of {', '.join(recipe_names())}, or a YAML file (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe"
-    )
-    parser.add_argument("--fresh", action="store_true", help="start over instead of continuing the run beside MODEL")
-    parser.add_argument(
-        "--device",
-        choices=("auto", "cpu", "cuda"),
-        default="auto",
-        help="where the networks train; auto: on a GPU if torch finds one (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--threads",
-        type=int,
-        default=1,
-        metavar="N",
-        help="CPU threads; the networks are small: more gain little, and lose much on a busy machine (default: 1)",
-    )
-    parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
-    parser.add_argument("--tensorboard", action="store_true", help="write logs for TensorBoard beside the checkpoint")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, or continue, and export. Raises one of ERRORS."""
+    """Train, or continue, and export.
+
+    Raises:
+        one of ERRORS.
+        KeyboardInterrupt: with a text, what was stopped and how it goes on.
+    """
+    if args.threads < 1:
+        raise TrainingError(f"--threads must be at least 1, it is {args.threads}")
     recipe = Recipe.load(args.recipe, args.set)
     folders = _run_folders(args, recipe)
     layout = load_layout(args.layout) if args.layout else None
     data = load_files(args.data, layout, args.topic, args.min_confidence)
     data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale)))
     _check(args, recipe, data)
-    torch.set_num_threads(max(1, args.threads))
+    torch.set_num_threads(args.threads)
     device = _device(args.device)
     with joined(device):
         if args.fresh and is_first():
@@ -141,7 +156,12 @@ def _run_folders(args: argparse.Namespace, recipe: Recipe) -> list[Path]:
 
 def _check(args: argparse.Namespace, recipe: Recipe, data: TrainingData) -> None:
     """What can be told before the first step."""
-    recipe.check_points(data.layout)
+    try:
+        recipe.check_points(data.layout)
+    except RecipeError as error:
+        if recipe.known_lengths != Recipe.load(args.recipe).known_lengths:
+            raise
+        raise RecipeError(f"recipe {args.recipe} is for layouts with the points that it names: {error}") from error
     if args.output and not recipe.steps and not recipe.regression_steps:
         raise RecipeError("no networks are trained with steps: 0, so there is no model: ask for --shapes instead of -o")
     if args.output:
@@ -187,7 +207,7 @@ def _watch(trainer: Trainer, args: argparse.Namespace) -> None:
     board = Board(trainer.folder, begun) if args.tensorboard and is_first() else None
     try:
         _prepare(trainer, quiet)
-        with _bar(quiet, total=trainer.steps, initial=begun, unit="step") as bar:
+        with _bar(quiet or not trainer.steps, total=trainer.steps, initial=begun, unit="step") as bar:
             for row in trainer.run():
                 bar.update()
                 if board:
@@ -196,7 +216,10 @@ def _watch(trainer: Trainer, args: argparse.Namespace) -> None:
                     losses = {"loss": row["loss"], "ae": row["recon_ae"], "ad": row["recon_ad"]}
                     bar.set_postfix({name: f"{value:.4f}" for name, value in losses.items()}, refresh=False)
     except KeyboardInterrupt:
-        raise TrainingError(f"stopped at step {trainer.step} of {trainer.steps}: the same command continues") from None
+        told = f"stopped at step {trainer.step} of {trainer.steps}: the same command continues"
+        if trainer.recipe.start != "random" and trainer.start is None:
+            told = "stopped while searching for a start: the same command begins again"
+        raise KeyboardInterrupt(told) from None
     finally:
         if board:
             board.close()
@@ -207,9 +230,16 @@ def _watch(trainer: Trainer, args: argparse.Namespace) -> None:
 def _prepare(trainer: Trainer, quiet: bool) -> None:
     if trainer.recipe.start == "random":
         return
+    with _share_bar(quiet, f"{trainer.recipe.start} start") as progress:
+        trainer.prepare(progress)
+
+
+@contextlib.contextmanager
+def _share_bar(quiet: bool, what: str) -> Iterator[Progress]:
+    """A bar that is told the share of the work that is done."""
     layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
-    with _bar(quiet, total=1.0, desc=f"{trainer.recipe.start} start", bar_format=layout) as bar:
-        trainer.prepare(lambda done: bar.update(done - bar.n))
+    with _bar(quiet, total=1.0, desc=what, bar_format=layout) as bar:
+        yield lambda done: bar.update(done - bar.n)
 
 
 def _bar(quiet: bool, **settings: object) -> tqdm:
@@ -225,10 +255,21 @@ def _write(runs: list[Run], args: argparse.Namespace) -> None:
         reconstruction_of(runs).save(args.shapes)
     if args.output:
         if best.recipe.codes == "free":
-            left = fit_encoder(best)
-            print(f"2D encoder fitted to the codes, mean distance left {left:.4f}", file=sys.stderr)
-        header = export_model(best, args.output, _command())
+            _fit_encoder(best, args.quiet)
+        header = export_model(best, runs[0].loss, args.output, _command())
     _report(runs, header, args)
+
+
+def _fit_encoder(trainer: Trainer, quiet: bool) -> None:
+    try:
+        with _share_bar(quiet, "2D encoder") as progress:
+            left = fit_encoder(trainer, progress=progress)
+    except KeyboardInterrupt:
+        told = "stopped while fitting the 2D encoder to the codes: the same command fits it anew, the rest is done"
+        raise KeyboardInterrupt(told) from None
+    print(
+        f"2D encoder fitted to the codes; its shapes are {100 * left:.1f} % of their size off theirs", file=sys.stderr
+    )
 
 
 def _command() -> str:
@@ -240,24 +281,37 @@ def _report(runs: list[Run], header: dict, args: argparse.Namespace) -> None:
     if len(runs) > 1:
         print("restarts by final loss, the first is kept:")
         for run in runs:
-            print(f"  seed {run.seed}  loss {run.loss:.5f}  {run.trainer.seconds:.0f} s")
+            print(f"  seed {run.seed}  {_told(run)}  {run.trainer.seconds:.0f} s")
     if args.shapes:
-        print(f"{args.shapes}: 3D shapes of {len(runs[0].trainer.data.W)} frames, loss {runs[0].loss:.5f}")
+        print(f"{args.shapes}: 3D shapes of {len(runs[0].trainer.data.W)} frames, {_told(runs[0])}")
     if args.output:
-        _report_model(header, args.output)
+        _report_model(runs[0], header, args.output)
     if args.json:
         ranking = [
-            {"seed": run.seed, "loss": run.loss, "seconds": round(run.trainer.seconds, 1), "chosen": run is runs[0]}
+            {
+                "seed": run.seed,
+                "loss": run.loss if math.isfinite(run.loss) else None,
+                "seconds": round(run.trainer.seconds, 1),
+                "chosen": run is runs[0],
+            }
             for run in runs
         ]
         write_atomically(args.json, json.dumps({**header, "restarts": ranking}, indent=1).encode())
 
 
-def _report_model(header: dict, path: Path) -> None:
+def _told(run: Run) -> str:
+    """A run's loss, by its right name."""
+    if math.isinf(run.loss):
+        return "diverged"
+    if run.trainer.recipe.steps:
+        return f"final loss {run.loss:.5f}"
+    return f"score of the start {run.loss:.5g} (negative log likelihood a frame, lower is better)"
+
+
+def _report_model(run: Run, header: dict, path: Path) -> None:
     training, metres = header["training"], header["metres_per_unit"]
     print(
-        f"{path}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
-        f"reconstruction loss {training['final']['recon_ad']:.4f}\n"
+        f"{path}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, {_told(run)}\n"
         f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}\n"
         f"  chirality: {'known' if header['chirality']['known'] else 'UNKNOWN'}, {header['chirality']['source']}"
     )

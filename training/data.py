@@ -227,11 +227,11 @@ def _read_bag(
 def _bag_keypoints(
     path: Path, layout: Layout, topic: str | None
 ) -> tuple[dict[str, list[msg_adapters.Keypoints2D]], msg_adapters.Intrinsics | None, str]:
-    """Keypoint messages by topic, the camera, and why the last refused message was."""
+    """Keypoint messages by topic, the camera, and why messages were refused, the last of every topic."""
     from paul_ros.bag import read_messages  # needs the extra "bags"
 
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
-    refused = ""
+    refused: dict[str, str] = {}
     cameras: set[msg_adapters.Intrinsics] = set()
     for name, type_name, message, _ in read_messages(path):
         try:
@@ -242,10 +242,10 @@ def _bag_keypoints(
                 if seen.persons:
                     frames.setdefault(name, []).append(seen)
         except msg_adapters.MessageError as error:
-            refused = f"; the last message refused on {name}: {error}"
+            refused[name] = f"; refused on {name}: {error}"
     if len(cameras) > 1:
         raise DataError(f"'{path}' has CameraInfo of {len(cameras)} cameras: keep that of the keypoints only")
-    return frames, cameras.pop() if cameras else None, refused
+    return frames, cameras.pop() if cameras else None, "".join(refused[name] for name in sorted(refused))
 
 
 def _checked(

@@ -7,6 +7,7 @@ import math
 
 import torch
 
+from training.starting import Progress
 from training.trainer import Trainer, turned_views
 
 STEPS = 3000
@@ -14,11 +15,11 @@ _BATCH = 128
 _LEARNING_RATE = 1e-3
 
 
-def fit_encoder(trainer: Trainer, steps: int = STEPS) -> float:
-    """Train h by regression to the run's free codes; returns the mean distance that is left, in units of W.
+def fit_encoder(trainer: Trainer, steps: int = STEPS, progress: Progress = lambda done: None) -> float:
+    """Train h by regression to the run's free codes; returns the mean distance that is left, as a share of the size.
 
-    Distances are of shapes, |f_d(h(W)) - f_d(phi)|, for codes have no scale of their own. Views are turned in their
-    plane by any angle and half of them mirrored: under an orthographic camera the code stays the same.
+    Distances are of shapes, |f_d(h(W)) - f_d(phi)| over |f_d(phi)|, for codes have no scale of their own. Views are
+    turned in their plane by any angle and half of them mirrored: under an orthographic camera the code stays the same.
     """
     networks, device = trainer.networks, trainer.device
     generator = torch.Generator().manual_seed(trainer.recipe.seed)
@@ -39,5 +40,6 @@ def fit_encoder(trainer: Trainer, steps: int = STEPS) -> float:
         for weight, gradient in zip(weights, gradients):
             weight.grad = gradient
         adam.step()
-        left.append(distance.detach())
+        left.append(distance.detach() / goal.square().sum((1, 2)).sqrt().mean())
+        progress((step + 1) / steps)
     return torch.stack(left[-100:]).mean().item()

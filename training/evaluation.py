@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from paul_ros import metrics
+from paul_ros.files import NpzError, read_npz
 from paul_ros.lifter import AMBIGUOUS, DEGENERATE_POINTS, TOO_FEW_POINTS
-from paul_ros.model import Model, load_model
+from paul_ros.model import Model, ModelError, load_model
 from paul_ros.onp import onp
 from paul_ros.replay import versions
 from training.categories import among_categories
@@ -92,10 +93,10 @@ def evaluate_model(
     """Lift every frame of a file and judge it; gives the report (keys as `paul replay --json`) and what was compared.
 
     Raises:
-        DataError: the file has no truth, or other points than the model.
+        DataError: the file has no truth, or other points than the model; or the model is a saved reconstruction.
         ModelError: the model cannot be used.
     """
-    model = load_model(model_name)
+    model = _model(model_name)
     truth = among_categories(load_sequence(data), model.layout)
     if len(model.layout.names) != truth.W.shape[2]:
         raise DataError(
@@ -109,6 +110,19 @@ def evaluate_model(
     return report | _single_times(model, truth), compared
 
 
+def _model(name: str | Path) -> Model:
+    try:
+        return load_model(name)
+    except ModelError:
+        try:
+            read_npz(name, ("shapes", "rotations"))
+        except NpzError:
+            pass
+        else:
+            raise DataError(f"'{name}' holds saved shapes, no model: name their data with --truth DATA") from None
+        raise
+
+
 def evaluate_shapes(shapes: str | Path, truth_file: str | Path) -> tuple[dict, Comparison]:
     """Judge a saved reconstruction against the truth of the same frames in the same order.
 
@@ -117,7 +131,11 @@ def evaluate_shapes(shapes: str | Path, truth_file: str | Path) -> tuple[dict, C
     """
     from training.reconstruction import load_reconstruction
 
-    truth, found = load_sequence(truth_file), load_reconstruction(shapes)
+    truth = load_sequence(truth_file)
+    try:
+        found = load_reconstruction(shapes)
+    except DataError as error:
+        raise DataError(f"{error}; a model is judged without --truth: MODEL DATA") from error
     if found.shapes.shape != truth.S.shape:
         raise DataError(
             f"'{shapes}' holds shapes {found.shapes.shape}, the truth in '{truth_file}' is {truth.S.shape}: "

@@ -23,8 +23,11 @@ _MEAN_ROUNDS = 10
 _CLEAR = 0.95  # share of shapes on one side of the handedness rules that settles the chirality
 
 
-def export_model(trainer: Trainer, path: Path, command: str) -> dict:
+def export_model(trainer: Trainer, loss: float, path: Path, command: str) -> dict:
     """Write encoder, decoder and mean shape; returns the header.
+
+    Args:
+        loss: the run's final one, see ``Reconstruction``.
 
     Raises:
         ModelError: the weights do not make a model (NaN, say).
@@ -46,7 +49,7 @@ def export_model(trainer: Trainer, path: Path, command: str) -> dict:
             "recipe": recipe.to_dict(),
             "steps": trainer.step,
             "seconds": round(trainer.seconds, 1),
-            "final": dict(zip(("loss", "recon_ae", "recon_ad"), _final(trainer))),
+            "final": {"loss": round(loss, 5)},
             "versions": {
                 "paul_ros": paul_ros.__version__,
                 "torch": torch.__version__.split("+")[0],
@@ -97,23 +100,18 @@ def _scale(trainer: Trainer) -> dict:
 def _weights(trainer: Trainer) -> dict[str, np.ndarray]:
     """What runs on the robot: h and f_d, under the names that ``paul_ros.model`` gives them."""
     return {
-        name: value.numpy()
+        name: value.cpu().numpy()
         for name, value in trainer.networks.state_dict().items()
         if name.startswith(("encoder.", "decoder."))
     }
-
-
-def _final(trainer: Trainer) -> tuple[float, ...]:
-    """Mean of the last logged losses."""
-    last = np.array([row[2:5] for row in trainer.rows[-10:]])
-    return tuple(round(float(value), 5) for value in last.mean(0))
 
 
 def _chirality(shapes: np.ndarray, mean: np.ndarray, layout: Layout, weight: float) -> dict:
     """Which of the two mirror images the model's shapes are, and how that is known.
 
     Without a rule to tell them apart, one sign for the whole model is left open by any number of orthographic views;
-    how far the shapes agree on it among themselves is measured by their mean shape.
+    how far the shapes agree on it among themselves is measured by their mean shape.  A rule speaks for its own category
+    only.
     """
     share = rule_share(shapes, layout)
     if share is None:
@@ -123,9 +121,12 @@ def _chirality(shapes: np.ndarray, mean: np.ndarray, layout: Layout, weight: flo
             "give the layout a handedness rule to settle it",
             "same_side_share": round(same_side_share(shapes, mean), 4),
         }
+    ruled = {point for rule in layout.handedness for point in rule.left}
+    open_ = [name for name, points in layout.categories.items() if ruled.isdisjoint(points)]
+    source = f"handedness rule of layout '{layout.name}', training weight {weight:g}"
     return {
-        "known": share >= _CLEAR,
-        "source": f"handedness rule of layout '{layout.name}', training weight {weight:g}",
+        "known": share >= _CLEAR and not open_,
+        "source": f"{source}; no rule for {', '.join(open_)}" if open_ else source,
         "training_share": round(share, 4),
     }
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import math
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from paul_ros.files import NpzError, read_npz, write_atomically
 from training.data import DataError, TrainingData, check_sizes
+from training.distributed import processes
 from training.objective import Views, fit, paul_terms
 from training.recipe import Recipe
 from training.solver import centre
@@ -75,7 +77,7 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run and its loss, as in ``Reconstruction``."""
+    """A finished run and its loss, as in ``Reconstruction``; infinite where it diverged."""
 
     trainer: Trainer
     loss: float
@@ -93,17 +95,27 @@ Watch = Callable[[Trainer], None]
 def train_restarts(
     data: TrainingData, recipe: Recipe, folder: Path, device: torch.device | str, watch: Watch
 ) -> list[Run]:
-    """Train the recipe's restarts one after the other, each in a folder of its own; best first.
+    """Train the recipe's restarts one after the other, each in a folder of its own; best first, diverged ones last.
 
     Raises:
-        TrainingError: see ``Trainer``.
+        TrainingError: all of them diverged; or see ``Trainer``.
     """
-    runs = []
+    runs, diverged = [], None
     for one in restarts(recipe):
         trainer = Trainer(data, one, run_folder(folder, recipe, one.seed), device)
         trainer.resume()
-        watch(trainer)
-        runs.append(Run(trainer, final_loss(trainer)))
+        try:
+            watch(trainer)
+        except TrainingError as error:
+            unusable = recipe.start != "random" and trainer.start is None
+            if unusable or processes() > 1:  # a start that cannot be read; or others wait for this process
+                raise
+            diverged = error
+            runs.append(Run(trainer, math.inf))
+        else:
+            runs.append(Run(trainer, final_loss(trainer)))
+    if diverged and all(math.isinf(run.loss) for run in runs):
+        raise diverged
     return sorted(runs, key=lambda run: run.loss)
 
 
@@ -140,10 +152,12 @@ def reconstruct(
         nonlocal finished
         tell = (lambda done: None) if progress is None else (lambda done: progress((finished + done) / recipe.restarts))
         begin = 0.0 if recipe.start == "random" else _START_SHARE if recipe.steps else 1.0
-        trainer.prepare(lambda done: tell(begin * done))
-        for row in trainer.run():
-            tell(begin + (1 - begin) * row["step"] / trainer.steps)
-        finished += 1
+        try:
+            trainer.prepare(lambda done: tell(begin * done))
+            for row in trainer.run():
+                tell(begin + (1 - begin) * row["step"] / trainer.steps)
+        finally:
+            finished += 1
         tell(0.0)
 
     runs = train_restarts(data, recipe, Path(folder), "cpu", watch)
