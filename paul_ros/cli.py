@@ -345,7 +345,8 @@ _STUDIES = {
 }
 _STUDY_EXAMPLES = """\
 FILE is an npz with W and the truth S, as for `paul evaluate`; only W and visible reach the trainer, frames shuffled.
-The folder gets NAME.png and NAME.json; work/ in it keeps the runs, so that an interrupted study goes on.
+Interpolation needs no S. The folder gets NAME.png and NAME.json; work/ in it keeps the runs, so that an interrupted
+study goes on.
 
 examples:
   paul study bottleneck --data drink.npz yoga.npz --seeds 10 -o out/studies
@@ -380,7 +381,7 @@ def _add_study(commands: argparse._SubParsersAction) -> None:
 
 
 def _add_study_files(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", metavar="FILE", type=Path, nargs="+", required=True, help="npz with W and S")
+    parser.add_argument("--data", metavar="FILE", type=Path, nargs="+", required=True, help="npz, see below")
     parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for table, picture, runs")
 
 
