@@ -23,7 +23,7 @@ from torch import Tensor
 from paul_ros.model import load_model
 from training.networks import build_networks
 from training.recipe import Recipe
-from training.solver import centre, solve_streams
+from training.solver import algebraic_camera, centre, solve_camera
 
 STEPS = 10  # of each solver in a round
 
@@ -50,11 +50,32 @@ def svd_streams(S_ae: Tensor, S_ad: Tensor, W: Tensor, visible: Tensor) -> tuple
     return R, (R[:, 2:] @ centre(S_ae + S_ad, visible))[:, 0] / 2
 
 
+def algebraic_streams(S_ae: Tensor, S_ad: Tensor, W: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+    """The same as the trainer has it, in closed form; differentiable."""
+    both = torch.cat([centre(S_ae, visible), centre(S_ad, visible)], dim=2)
+    R = algebraic_camera(both, torch.cat([W, W], dim=2), torch.cat([visible, visible], dim=1), "unit").R
+    return R, (R[:, 2:] @ centre(S_ae + S_ad, visible))[:, 0] / 2
+
+
+@torch.no_grad()
+def exact_streams(S_ae: Tensor, S_ad: Tensor, W: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+    """The global optimum of the same problem (equation 8), a constant to autograd.
+
+    The best depth is the mean of the two streams'; what then is left of their difference does not depend on R, so the
+    rest is orthographic-N-point of their mean. No gradient is needed where the loss is this cost: at an optimum it does
+    not change with the pose (envelope theorem).
+    """
+    mean = centre(S_ae + S_ad, visible) / 2
+    R = solve_camera(mean, W, visible, "unit").R
+    return R, (R[:, 2:] @ mean)[:, 0]
+
+
 SOLVERS: dict[str, Callable[..., tuple[Tensor, Tensor]]] = {
     "svd": svd_streams,
-    "algebraic": lambda *problem: solve_streams(*problem, "algebraic"),
-    "exact": lambda *problem: solve_streams(*problem, "exact"),
+    "algebraic": algebraic_streams,
+    "exact": exact_streams,
 }
+"""Of streams (N,3,P), views (N,2,P), visibility (N,P): R (N,3,3) and z (N,P) about the mean of the visible points."""
 
 
 class Run:

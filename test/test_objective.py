@@ -22,7 +22,7 @@ from training.objective import (
     undo_perspective,
 )
 from training.recipe import Recipe
-from training.solver import centre, solve_streams
+from training.solver import algebraic_camera, centre
 
 COCO = load_layout("coco17")
 BARE = {"handedness_weight": 0, "bone_weight": 0, "hidden": [8, 16], "width": 16, "bottleneck": 4}
@@ -89,9 +89,10 @@ def test_the_algebraic_camera_is_that_of_both_streams():
     networks, _, views = case(0.3, recipe)
     found = fit(networks, recipe, views, ROWS)
     S_ae = networks.decoder(networks.shape_encoder(found.shape))
-    R, z = solve_streams(S_ae, found.shape, views.W, views.visible, "algebraic")
+    both = torch.cat([centre(S, views.visible) for S in (S_ae, found.shape)], dim=2)
+    R = algebraic_camera(both, torch.cat([views.W] * 2, dim=2), torch.cat([views.visible] * 2, dim=1), "unit").R
     torch.testing.assert_close(found.camera.R, R)
-    torch.testing.assert_close(found.points[:, 2], z)
+    torch.testing.assert_close(found.points[:, 2], (R[:, 2:] @ centre(S_ae + found.shape, views.visible))[:, 0] / 2)
 
 
 def test_no_camera_is_better_than_the_exact_one():

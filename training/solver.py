@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lower level of the bilevel objective: the camera of every shape of a batch, with gradients for every loss.
 
-Three ways, for different losses:
+Two ways:
 
-- ``solve_streams`` is the paper's lower-level problem itself, its two reconstruction streams, unknown depth and unit
-  scale.  Solved exactly, its solution needs no gradient of its own where the training loss is the same squared cost:
-  at an optimum the cost does not change with the pose (envelope theorem).
-- ``solve_camera`` is the exact optimum as a differentiable function, for every other loss, by the implicit function
-  theorem. ``objective.py`` trains with it, for its losses are unsquared and more than one.
+- ``solve_camera`` is the exact optimum as a differentiable function, by the implicit function theorem.
 - ``algebraic_camera`` is the paper's own approximation, least squares projected onto the rotations (section 4.2).
 
 Exact means the global optimum of ``paul_ros.onp``, which solves on the CPU; only second moments, 25 numbers a shape,
@@ -16,7 +12,7 @@ travel there.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -47,63 +43,13 @@ def centre(X: Tensor, visible: Tensor) -> Tensor:
     return X - X @ (seen / seen.sum(2, keepdim=True)).transpose(1, 2)
 
 
-def solve_streams(
-    S_ae: Tensor, S_ad: Tensor, W: Tensor, visible: Tensor, solver: Literal["exact", "algebraic"] = "exact"
-) -> tuple[Tensor, Tensor]:
-    """The paper's lower-level problem (equation 8): rotation and depth that fit both reconstruction streams.
-
-    Minimise ``|R S_ae - [W; z]|^2 + |R S_ad - [W; z]|^2`` over the visible points. The best depth is the mean of the
-    two streams' (step 3); what then is left of the streams' difference does not depend on R, so the rest is
-    orthographic-N-point of their mean. The paper's step 1 fits an affine camera to both streams instead, as if every
-    point had been seen twice.
-
-    Args:
-        S_ae, S_ad: (N,3,P) shapes of the auto-encoder and the auto-decoder stream, canonical frame.
-        W: (N,2,P) image points; anything finite where hidden.
-        visible: (N,P) bool, at least three a shape.
-        solver: ``"exact"`` gives the global optimum, without gradient: none is needed where the loss is this cost.
-            ``"algebraic"`` gives the paper's approximation, differentiable.
-
-    Returns:
-        R (N,3,3) and z (N,P), the depth about the mean of the visible points.
-
-    Raises:
-        ValueError: there is no such solver.
-    """
-    if solver not in ("exact", "algebraic"):
-        raise ValueError(f"solver is 'exact' or 'algebraic', not {solver!r}")
-    mean = centre(S_ae + S_ad, visible) / 2
-    if solver == "exact":
-        R = optimal_camera(mean, W, visible, "unit").R
-        return R, (R[:, 2:] @ mean.detach())[:, 0]
-    both = torch.cat([centre(S_ae, visible), centre(S_ad, visible)], dim=2)
-    R = algebraic_camera(both, torch.cat([W, W], dim=2), torch.cat([visible, visible], dim=1), "unit").R
-    return R, (R[:, 2:] @ mean)[:, 0]
-
-
-@torch.no_grad()
-def optimal_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -> Camera:
-    """The global optimum of orthographic-N-point, a constant to autograd.
-
-    Args:
-        S: (N,3,P) shapes, canonical frame.
-        W: (N,2,P) image points; anything finite where hidden.
-        visible: (N,P) bool, at least three a shape.
-
-    Returns:
-        The camera that minimises ``|scale * R[:, :2] @ centre(S) - centre(W)|`` over the visible points; the identity
-        where they fix none (and scale 0 if that is free).
-    """
-    return solve_camera(S, W, visible, scale)
-
-
 def algebraic_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -> Camera:
     """The paper's own solver: the least-squares affine camera M, its singular values set to their mean (or to 1).
 
     U V^T of M's singular value decomposition is its polar factor (M M^T)^(-1/2) M, which for two rows has a closed
     form; that is smooth where the singular values coincide, as U and V are not. Differentiable in S and W.
 
-    Args and returns are those of ``optimal_camera``.
+    Args and returns are those of ``solve_camera``.
     """
     seen = visible[:, None].to(S.dtype)
     S, W = centre(S, visible) * seen, centre(W, visible) * seen
@@ -119,7 +65,17 @@ def algebraic_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free
 
 
 def solve_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -> Camera:
-    """The global optimum as a function of S and W that autograd can differentiate; see ``optimal_camera``."""
+    """The global optimum of orthographic-N-point, differentiable in S and W.
+
+    Args:
+        S: (N,3,P) shapes, canonical frame.
+        W: (N,2,P) image points; anything finite where hidden.
+        visible: (N,P) bool, at least three a shape.
+
+    Returns:
+        The camera that minimises ``|scale * R[:, :2] @ centre(S) - centre(W)|`` over the visible points; the identity
+        where they fix none (and scale 0 if that is free).
+    """
     R, s = _Optimum.apply(S, W, visible, scale)
     return Camera(R, s[:, None, None])
 
