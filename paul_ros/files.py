@@ -11,6 +11,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+_NAMED = 5  # arrays in a message
+
 
 class NpzError(ValueError):
     """An npz that cannot be used; the text says why, and goes after the file's name."""
@@ -32,9 +34,10 @@ def read_npz(
         raise NpzError("is not there") from error
     except Exception as error:  # numpy and zipfile report damage in a dozen ways; numpy's own advice is to unpickle
         raise NpzError("holds pickled objects or is no npz: save plain arrays with np.savez") from error
-    missing = [name for name in needed if name not in there]
-    if missing:
-        raise NpzError(f"has no array {' or '.join(missing)}; it has {', '.join(there) or 'none'}")
+    for name in needed:
+        if name not in there:
+            more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
+            raise NpzError(f"has no array {name}; it has {', '.join(there[:_NAMED]) or 'none'}{more}")
     return arrays
 
 

@@ -163,6 +163,7 @@ def test_a_saved_reconstruction_is_read_again(tmp_path):
 NO_RECONSTRUCTION = {
     "nothing": (None, "is not there"),
     "data": (dict(W=np.zeros((4, 2, 5))), "has no array shapes; it has .*W"),
+    "much else": ({f"a{i}": 0 for i in range(9)}, "it has rotations, loss, seconds, a0, a1 and 7 more"),
     "2D": (dict(shapes=np.zeros((4, 2, 5))), r"not \(F,3,P\)"),
     "pickled": (dict(shapes=np.array([{}])), "plain arrays with np.savez"),
     "a loss in words": (dict(shapes=np.zeros((4, 3, 5)), loss="low"), "no numbers"),

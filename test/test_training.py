@@ -353,7 +353,7 @@ def test_a_bag_is_learned_from_and_lifted_with(tmp_path):
 
 
 def test_a_bag_in_another_layout_says_which_would_fit(tmp_path):
-    with pytest.raises(DataError, match="no 2D keypoints of layout 'body25'.* refused on /keypoints: 17 keypoints"):
+    with pytest.raises(DataError, match="no 2D keypoints of layout 'body25'; refused on .*/keypoints: 17 keypoints"):
         load_training_data(BAG, load_layout("body25"))
 
 

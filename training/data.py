@@ -242,10 +242,15 @@ def _bag_keypoints(
                 if seen.persons:
                     frames.setdefault(name, []).append(seen)
         except msg_adapters.MessageError as error:
-            refused[name] = f"; refused on {name}: {error}"
+            refused[name] = str(error)
     if len(cameras) > 1:
         raise DataError(f"'{path}' has CameraInfo of {len(cameras)} cameras: keep that of the keypoints only")
-    return frames, cameras.pop() if cameras else None, "".join(refused[name] for name in sorted(refused))
+    return frames, cameras.pop() if cameras else None, _told(refused)
+
+
+def _told(refused: dict[str, str]) -> str:
+    topics = {why: [name for name in sorted(refused) if refused[name] == why] for why in refused.values()}
+    return "".join(f"; refused on {' and '.join(names)}: {why}" for why, names in topics.items())
 
 
 def _checked(
