@@ -68,7 +68,7 @@ def test_two_processes_train_as_one(tmp_path, monkeypatch):
         first, second = (dict(zip(LOG_COLUMNS, row)) for row in (a, b))
         for name in LOG_COLUMNS[2:9]:
             assert second[name] == pytest.approx(first[name], rel=1e-4, abs=1e-6), name
-        assert first["bones"] > 0.01 and first["nuclear"] > 1
+        assert first["bones"] > 0.01 and first["nuclear"] > 0.1
     for a, b in zip(one.networks.parameters(), two.networks.parameters()):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
 

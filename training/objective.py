@@ -188,7 +188,7 @@ def _terms(
     if recipe.bone_weight:
         bones = bone_variation(shape, layout)
     if recipe.nuclear_weight:
-        nuclear = torch.linalg.matrix_norm(shape.flatten(1), "nuc")
+        nuclear = torch.linalg.matrix_norm(shape.flatten(1), "nuc") / len(shape)  # the others are means of the batch
     theta = parameters_to_vector(networks.decoder.parameters())
     loss = (
         recon_ae

@@ -66,7 +66,9 @@ class Recipe:
     restarts: int = 1  # runs from this seed on; the one with the lowest final loss is kept
     code_weight: float = 4.1231e-3  # the paper: 0.01
     decay_weight: float = 0.0  # of |theta_d|^2; the paper: 1e-4
-    nuclear_weight: float = 0.0  # of the nuclear norm of a batch's shapes; the paper's ADL + low rank: 0.01
+    nuclear_weight: float = (
+        0.0  # of the nuclear norm of a batch's shapes, over their number; the paper's ADL + low rank: 0.01
+    )
     handedness_weight: float = 1.0  # beyond the paper: keeps frames from settling on mirrored shapes
     bone_weight: float = 1.0  # beyond the paper: edges of the layout keep their lengths
     upright: bool = False  # h sees every view turned and mirrored to one side: for cameras that roll freely, where it
