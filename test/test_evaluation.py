@@ -127,6 +127,26 @@ def test_hidden_points_count_and_are_told_apart(model_file, tmp_path):
     assert report["ne_visible_percent"] < report["ne_flip_frame_percent"] < report["ne_hidden_percent"]
 
 
+def test_errors_are_also_those_of_s_cam(model_file, tmp_path):
+    """With x and y of visible points as they were seen, what is left is their depth and the whole of hidden ones."""
+    S = turned(model_file)
+    truth = S + np.random.default_rng(0).normal(0, 2.0, S.shape)
+    visible = np.ones((12, 17), bool)
+    visible[:, 9] = False
+    data = write(tmp_path / "d.npz", truth, W=truth[:, :2], visible=visible)
+    report = evaluate(model_file, data, tmp_path)
+    found = evaluation.predict(load_model(model_file), truth[:, :2], visible).S.astype(float)
+    off = found - evaluation.centred(truth, visible)
+    off[:, :2] *= ~visible[:, None]
+    off -= off.mean(2, keepdims=True)
+    size = np.linalg.norm(truth - truth.mean(2, keepdims=True), axis=(1, 2))
+    assert report["observed"]["ne_flip_frame_percent"] == pytest.approx(
+        100 * (np.linalg.norm(off, axis=(1, 2)) / size).mean(), rel=1e-3
+    )
+    assert report["observed"]["ne_flip_frame_percent"] < report["ne_flip_frame_percent"]
+    assert report["observed"]["reprojection_median_percent"] == pytest.approx(0, abs=1e-3)
+
+
 def test_what_a_hidden_point_holds_is_not_looked_at(model_file, tmp_path):
     S = turned(model_file)
     visible = np.random.default_rng(0).random((12, 17)) < 0.7
