@@ -47,7 +47,7 @@ def few_starts(monkeypatch):
     patch(monkeypatch, linear_model, {"_REFINEMENTS": 2})
     patch(monkeypatch, LinearModel, {"searched": partialmethod(LinearModel.searched, count=40)})
     few = ((0.1, 4), (0.05, 4))
-    patch(monkeypatch, synchronise, {"_ROUNDS": (3, 4), "_REFIT": few, "_REBUILT": few})
+    patch(monkeypatch, synchronise, {"_ROUNDS": 2, "_STAGES": ((2, 3), (3, 4)), "_REFIT": few, "_REBUILT": few})
 
 
 @pytest.fixture

@@ -61,7 +61,8 @@ class Recipe:
     batch: int = 256  # 0: all frames at every step
     learning_rate: float = 1e-3  # Adam, warmed up over 200 steps, then a cosine to zero, in either phase
     code_learning_rate: float = 1e-2  # of free codes, which each frame has to itself
-    patience: int = 0  # stop when so many steps lowered the mean loss by less than 0.1 %; 0: go through
+    patience: int = 0  # stop when so many steps lowered the mean loss by less than 0.1 %; 0: go through, which ends
+    # better: a run that is stopped never comes to the low rates of its schedule's end
     seed: int = 0
     restarts: int = 1  # runs from this seed on; the one with the lowest final loss is kept
     code_weight: float = 4.1231e-3  # the paper: 0.01

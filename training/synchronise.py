@@ -4,8 +4,8 @@
 An orthographic view fits a shape and its mirror image alike. Where cameras and poses vary much, a reconstruction is
 right up to its mirror image within each region of pose space, and regions disagree. Two frames of alike poses tell
 whether they agree: one is nearer to the other or to the other's mirror image. So frames are clustered by likeness up to
-mirroring, signs made equal within each cluster, and whole clusters flipped wherever a linear model then explains the
-views better.
+mirroring, signs made equal within each cluster, and whole clusters flipped wherever the shapes then need fewer
+principal directions; a linear model refitted to the views tells whether that was right.
 """
 
 from __future__ import annotations
@@ -20,11 +20,14 @@ from torch import Tensor
 from training.linear_model import LinearModel, Observations
 from training.starting import Progress
 
-_AGREEING = 0.975  # of nearest neighbours: 1.00 on sequences of one camera path, 0.99 at the truth of random cameras
+_AGREEING = 0.995  # of nearest neighbours: 1.00 on sequences of one camera path; 0.98 where a third is mirrored
 _FLAT = 1e-4
 _TINY = 1e-100  # its cube is a number still
-_ROUNDS = (24, 24, 48)  # clusters
-_TRIES = 3
+_ROUNDS = 4
+_STAGES = ((5, 24), (6, 24), (6, 48), (8, 48))
+"""Principal directions that shapes may fill in a round's stages, and clusters. Few directions find the way from afar;
+many have room for mixtures of shapes and mirror images."""
+_SWEEPS = 3
 _LEAST_CLUSTER = 8  # frames, on average
 _NEIGHBOURS = 10
 _BASES = 12
@@ -105,42 +108,24 @@ def synchronised(
 ) -> LinearModel:
     """A model whose frames show one mirror image; the one that is given, where they do.
 
-    Flips of one cluster at a time get stuck for some clusterings: a few are tried, and the most likely model is taken.
-    """
-    if agreeing_share(_shapes(model, seen)) >= _AGREEING:
-        return model
-    best, least = model, _settled(model, seen).objective(seen, _REBUILT[-1][0], 0.0)
-    for number in range(_TRIES):
-        tell = partial(_tell_part, progress, number, _TRIES)
-        found, cost = _flipped_in_rounds(model, seen, generator, tell)
-        if cost < least:
-            best, least = found, cost
-        if agreeing_share(_shapes(best, seen)) >= _AGREEING:
-            break
-    return best
-
-
-def _flipped_in_rounds(
-    model: LinearModel, seen: Observations, generator: np.random.Generator, progress: Progress
-) -> tuple[LinearModel, float]:
-    """The model after rounds of flips, and its mean negative log likelihood.
-
-    Of few frames or wild poses neighbours tell little even at the truth: a round that makes the views less likely is
-    taken back.
+    After every round of flips the model is refitted to the views.  Of few frames or wild poses neighbours tell little
+    even at the truth: a round that makes the views less likely is taken back.
     """
     X = _shapes(model, seen)
+    if agreeing_share(X) >= _AGREEING:
+        return model
     bases, (sigma, _) = len(model.V) - 1, _REBUILT[-1]
-    few = min(_BASES, bases)
     least = _settled(model, seen).objective(seen, sigma, 0.0)
-    for number, clusters in enumerate(_ROUNDS):
-        tell = partial(_tell_part, progress, number, len(_ROUNDS))
-        other = _rebuilt(flipped(X, seen, few, clusters, generator, tell), seen, few, bases, generator)
-        if (found := other.objective(seen, sigma, 0.0)) >= least:
-            continue
-        model, least, X = other, found, _shapes(other, seen)
-        if agreeing_share(X) >= _AGREEING:
-            break
-    return model, least
+    for number in range(_ROUNDS):
+        tell = partial(_tell_part, progress, number, _ROUNDS)
+        for stage, (directions, clusters) in enumerate(_STAGES):
+            X = flipped(X, directions, clusters, generator)
+            tell((stage + 1) / (len(_STAGES) + 1))
+        other = _rebuilt(X, seen, min(_BASES, bases), bases, generator)
+        if (found := other.objective(seen, sigma, 0.0)) < least:
+            model, least = other, found
+        X = _shapes(model, seen)
+    return model
 
 
 def _tell_part(progress: Progress, number: int, parts: int, done: float) -> None:
@@ -165,31 +150,37 @@ def _shapes(model: LinearModel, seen: Observations) -> Tensor:
     return X - X.mean(2, keepdim=True)
 
 
-def flipped(
-    X: Tensor, seen: Observations, bases: int, clusters: int, generator: np.random.Generator, progress: Progress
-) -> Tensor:
-    """Shapes (F,3,P) in camera frame, clusters of them mirrored wherever that makes the views more likely.
+def flipped(X: Tensor, directions: int, clusters: int, generator: np.random.Generator) -> Tensor:
+    """Shapes (F,3,P) in camera frame, clusters of them mirrored wherever that leaves less energy (``energy_outside``).
 
     Args:
-        bases: of the linear model that tells.
         clusters: at most so many.
     """
     clusters = min(clusters, max(2, len(X) // _LEAST_CLUSTER))
     close, sign = likeness(X, X)
     labels = _clusters(close, clusters, generator)
     X = _agreeing(X, close, sign, labels)
-
-    def cost(X: Tensor) -> float:
-        return fitted(X, seen, bases, _REFIT).objective(seen, _REFIT[-1][0], 0.0)
-
-    least = cost(X)
-    present = labels.unique().numpy()
-    for number, cluster in enumerate(generator.permutation(present)):
-        other = torch.where((labels == cluster)[:, None, None], mirrored(X), X)
-        if (found := cost(other)) < least:
-            X, least = other, found
-        progress((number + 1) / len(present))
+    least = energy_outside(X, directions)
+    for _ in range(_SWEEPS):
+        before = least
+        for cluster in generator.permutation(labels.unique().numpy()):
+            other = torch.where((labels == cluster)[:, None, None], mirrored(X), X)
+            if (found := energy_outside(other, directions)) < least:
+                X, least = other, found
+        if least == before:
+            break
     return X
+
+
+def energy_outside(X: Tensor, directions: int) -> float:
+    """Mean squared size of shapes (F,3,P), turned onto their mean, outside so many principal directions.
+
+    A mixture of shapes and mirror images needs more directions than the shapes alone.
+    """
+    canonical, _ = aligned(X)
+    D = (canonical - canonical.mean(0)).flatten(1)
+    gram = D.T @ D if D.shape[1] < len(D) else D @ D.T
+    return float(torch.linalg.eigvalsh(gram / len(D))[: -directions or None].sum())
 
 
 def _clusters(close: Tensor, count: int, generator: np.random.Generator) -> Tensor:
