@@ -7,20 +7,29 @@ and no message package is imported. A family is chosen by its type name as bags 
 
 from __future__ import annotations
 
-from msg_adapters import point_cloud2, pose_array, yolo
+from msg_adapters import ai, hri, opendr, openpose, point_cloud2, pose_array, yolo, zed
 from msg_adapters.camera_info import read_camera_info
-from msg_adapters.keypoints import Intrinsics, Keypoints2D, MessageError, WrongPointCount
+from msg_adapters.keypoints import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, join
 
-#: Type name -> reader(msg, points) -> Keypoints2D.
+#: Type name -> reader(msg, points, source) -> Keypoints2D.
 SUPPORTED = {
     "sensor_msgs/msg/PointCloud2": point_cloud2.read,
     "geometry_msgs/msg/PoseArray": pose_array.read,
     "yolo_msgs/msg/DetectionArray": yolo.read,
+    "hri_msgs/msg/Skeleton2D": hri.read,
+    "zed_msgs/msg/ObjectsStamped": zed.read,
+    "ai_msgs/msg/PerceptionTargets": ai.read,
+    "opendr_interface/msg/OpenDRPose2D": opendr.read,
+    "openpose_ros2_msgs/msg/PoseKeyPointsList": openpose.read_list,
+    "ros_openpose/msg/Frame": openpose.read_frame,
 }
 
+#: Types whose message is one person: those of one stamp are of one image.
+ONE_PERSON = frozenset({"hri_msgs/msg/Skeleton2D", "opendr_interface/msg/OpenDRPose2D"})
 
-def read(type_name: str, msg, points: int) -> Keypoints2D:
-    """Reads a 2D keypoint message whose layout has `points` keypoints.
+
+def read(type_name: str, msg, points: int, source: Source = Source()) -> Keypoints2D:
+    """Reads a 2D keypoint message for a layout of `points` keypoints.
 
     Raises MessageError with a reason to count by and a sentence that says what to do.
     """
@@ -30,7 +39,18 @@ def read(type_name: str, msg, points: int) -> Keypoints2D:
             "unknown_type",
             f"{type_name} is no keypoint message that can be read here; readable are {', '.join(SUPPORTED)}",
         )
-    return reader(msg, points)
+    return reader(msg, points, source)
 
 
-__all__ = ["Intrinsics", "Keypoints2D", "MessageError", "SUPPORTED", "WrongPointCount", "read", "read_camera_info"]
+__all__ = [
+    "ONE_PERSON",
+    "SUPPORTED",
+    "Intrinsics",
+    "Keypoints2D",
+    "MessageError",
+    "Source",
+    "WrongPointCount",
+    "join",
+    "read",
+    "read_camera_info",
+]

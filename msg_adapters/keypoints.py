@@ -6,6 +6,7 @@ Shapes: N persons, P keypoints, point-major (N, P, 2). Pixels, x right, y down.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -44,6 +45,20 @@ def split_persons(total: int, points: int) -> int:
 
 
 @dataclass(frozen=True)
+class Source:
+    """What a reader may need to know beside the message itself.
+
+    names: of the layout's P keypoints, for families that tell which point is which; () = unknown.
+    image_size: width and height in pixels, for families that normalise by them; None = unknown.
+    topic: that the message came from, for families that put the person's id there; '' = unknown.
+    """
+
+    names: tuple[str, ...] = ()
+    image_size: tuple[int, int] | None = None
+    topic: str = ""
+
+
+@dataclass(frozen=True)
 class Keypoints2D:
     """The 2D keypoints of all persons in one image.
 
@@ -68,6 +83,18 @@ class Keypoints2D:
         return self.xy.shape[0]
 
 
+def join(parts: list[Keypoints2D]) -> Keypoints2D:
+    """The persons of several records of one image, in order; stamp and frame are the first one's."""
+    return Keypoints2D(
+        np.concatenate([part.xy for part in parts]),
+        np.concatenate([part.confidence for part in parts]),
+        np.concatenate([part.visible for part in parts]),
+        tuple(name for part in parts for name in part.ids),
+        parts[0].stamp,
+        parts[0].frame_id,
+    )
+
+
 @dataclass(frozen=True)
 class Intrinsics:
     """A pinhole camera without distortion: focal lengths, principal point and image size, all in pixels.
@@ -89,6 +116,36 @@ class Intrinsics:
 def stamp_ns(header) -> int:
     """The header's stamp in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def nobody(points: int, header) -> Keypoints2D:
+    """The record of an image without persons, for a layout of `points` keypoints."""
+    return record(np.empty((0, points, 2)), None, (), header)
+
+
+def by_name(values: np.ndarray, own: tuple[str, ...], names: tuple[str, ...]) -> np.ndarray:
+    """Q points (..., Q, C) in a family's own order as (..., P, C) of the layout; NaN for points the family lacks.
+
+    own: Q names, '' for a point that is none of the body's usual ones; names: P of the layout.
+    Raises MessageError no_common_names.
+    """
+    here, there = _common(own, names)
+    placed = np.full((*values.shape[:-2], len(names), values.shape[-1]), np.nan)
+    placed[..., there, :] = values[..., here, :]
+    return placed
+
+
+@functools.lru_cache(maxsize=64)
+def _common(own: tuple[str, ...], names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the points that both have: in own, in names."""
+    pairs = [(index, names.index(name)) for index, name in enumerate(own) if name in names]
+    if not pairs:
+        raise MessageError(
+            "no_common_names",
+            f"the layout has none of the points that this message names ({', '.join(filter(None, own))}); "
+            "set the parameter `layout` to one of the same kind of object",
+        )
+    return tuple(np.array(pairs).T)
 
 
 def record(

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, MessageError, WrongPointCount, record, split_persons
+from msg_adapters.keypoints import Keypoints2D, MessageError, Source, WrongPointCount, record, split_persons
 
 #: sensor_msgs/PointField datatype -> numpy type without byte order.
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
-def read(msg, points: int) -> Keypoints2D:
+def read(msg, points: int, _source: Source) -> Keypoints2D:
     """Reads a cloud of keypoints whose layout has `points` of them; an empty cloud is zero persons.
 
     Raises MessageError: wrong_fields, not_2d, wrong_steps, truncated_data, wrong_point_count.

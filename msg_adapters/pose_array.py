@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, MessageError, record, split_persons
+from msg_adapters.keypoints import Keypoints2D, MessageError, Source, record, split_persons
 
 _MOST_CONFIDENCE = 1.05
 
 
-def read(msg, points: int) -> Keypoints2D:
+def read(msg, points: int, _source: Source) -> Keypoints2D:
     """Reads poses as 2D keypoints whose layout has `points` of them; no pose is zero persons.
 
     Raises MessageError: not_2d (a z outside 0..1.05 is a depth, not a confidence), wrong_point_count.

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, MessageError, WrongPointCount, record
+from msg_adapters.keypoints import Keypoints2D, MessageError, Source, WrongPointCount, record
 
 
-def read(msg, points: int) -> Keypoints2D:
+def read(msg, points: int, _source: Source) -> Keypoints2D:
     """Reads detections as persons of a layout with `points` keypoints.
 
     A detection without keypoints is a person of whom no point is visible.

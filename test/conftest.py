@@ -22,19 +22,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_messages import DEFINITIONS
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROOT = Path(__file__).resolve().parent.parent
-
-#: yolo_msgs of yolo_ros, as far as keypoints go; the package itself is on no index.
-YOLO_DEFINITIONS = {
-    "yolo_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
-    "yolo_msgs/msg/KeyPoint2D": "int32 id\nyolo_msgs/Point2D point\nfloat64 score\n",
-    "yolo_msgs/msg/KeyPoint2DArray": "yolo_msgs/KeyPoint2D[] data\n",
-    "yolo_msgs/msg/Detection": "int32 class_id\nstring class_name\nfloat64 score\nstring id\n"
-    "yolo_msgs/KeyPoint2DArray keypoints\n",
-    "yolo_msgs/msg/DetectionArray": "std_msgs/Header header\nyolo_msgs/Detection[] detections\n",
-}
 
 
 class RosMake:
@@ -50,11 +41,11 @@ class RosMake:
 
 
 class BagMake:
-    """Factory of rosbags' dataclasses, with yolo_msgs registered."""
+    """Factory of rosbags' dataclasses, with the foreign packages registered."""
 
     def __init__(self) -> None:
         self.store = get_typestore(Stores.ROS2_JAZZY)
-        for name, text in YOLO_DEFINITIONS.items():
+        for name, text in DEFINITIONS.items():
             self.store.register(get_types_from_msg(text, name))
 
     def __call__(self, type_name: str, **fields):
@@ -63,6 +54,11 @@ class BagMake:
     @staticmethod
     def octets(data: bytes):
         return np.frombuffer(data, np.uint8)
+
+    @staticmethod
+    def floats(values):
+        """A float32[] field."""
+        return np.array(values, np.float32)
 
     def through_cdr(self, msg):
         """The message as a bag gives it back; that also checks that every field is fit to be written."""

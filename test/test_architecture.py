@@ -26,6 +26,12 @@ ROS = {
     "std_msgs",
     "visualization_msgs",
     "yolo_msgs",
+    "hri_msgs",
+    "zed_msgs",
+    "ai_msgs",
+    "opendr_interface",
+    "openpose_ros2_msgs",
+    "ros_openpose",
     "ament_index_python",
 }
 #: On every robot; all else is imported where it is needed, by those who asked for a bag or a picture.

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of packages that are on no index: their fields as far as keypoints go, and how each family says a pose.
+
+A pose is {keypoint name: (x, y)} in pixels, names as layouts spell them. Every builder takes a factory `make`, so the
+same message is built of what rclpy gives (LiveMake) and of what a bag gives (conftest.BagMake).
+"""
+
+from __future__ import annotations
+
+import array
+from types import SimpleNamespace
+
+import numpy as np
+
+CLOUD, POSES, YOLO = ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "yolo_msgs/msg/DetectionArray")
+HRI, ZED, AI = ("hri_msgs/msg/Skeleton2D", "zed_msgs/msg/ObjectsStamped", "ai_msgs/msg/PerceptionTargets")
+OPENDR = "opendr_interface/msg/OpenDRPose2D"
+OPENPOSE_LIST, OPENPOSE_FRAME = "openpose_ros2_msgs/msg/PoseKeyPointsList", "ros_openpose/msg/Frame"
+
+#: Type name -> text of its .msg file, what is used before what uses it.
+DEFINITIONS = {
+    "yolo_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
+    "yolo_msgs/msg/KeyPoint2D": "int32 id\nyolo_msgs/Point2D point\nfloat64 score\n",
+    "yolo_msgs/msg/KeyPoint2DArray": "yolo_msgs/KeyPoint2D[] data\n",
+    "yolo_msgs/msg/Detection": "int32 class_id\nstring class_name\nfloat64 score\nstring id\n"
+    "yolo_msgs/KeyPoint2DArray keypoints\n",
+    YOLO: "std_msgs/Header header\nyolo_msgs/Detection[] detections\n",
+    "hri_msgs/msg/NormalizedPointOfInterest2D": "float32 x\nfloat32 y\nfloat32 c\n",
+    HRI: "std_msgs/Header header\nhri_msgs/NormalizedPointOfInterest2D[18] skeleton\n",
+    "zed_msgs/msg/Keypoint2Df": "float32[2] kp\n",
+    "zed_msgs/msg/Skeleton2D": "zed_msgs/Keypoint2Df[70] keypoints\n",
+    "zed_msgs/msg/Object": "string label\nint16 label_id\nfloat32 confidence\nbool skeleton_available\n"
+    "int8 body_format\nzed_msgs/Skeleton2D skeleton_2d\n",
+    ZED: "std_msgs/Header header\nzed_msgs/Object[] objects\n",
+    "ai_msgs/msg/Point": "string type\ngeometry_msgs/Point32[] point\nfloat32[] confidence\n",
+    "ai_msgs/msg/Target": "string type\nuint64 track_id\nai_msgs/Point[] points\n",
+    AI: "std_msgs/Header header\nint16 fps\nai_msgs/Target[] targets\nai_msgs/Target[] disappeared_targets\n",
+    "opendr_interface/msg/OpenDRPose2DKeypoint": "string kpt_name\nint32 x\nint32 y\n",
+    OPENDR: "std_msgs/Header header\nint32 pose_id\nfloat32 conf\n"
+    "opendr_interface/OpenDRPose2DKeypoint[] keypoint_list\n",
+    "openpose_ros2_msgs/msg/PoseKeyPoint": "float32 x\nfloat32 y\nfloat32 score\n",
+    "openpose_ros2_msgs/msg/PoseKeyPoints": "openpose_ros2_msgs/PoseKeyPoint[] pose_key_points\n",
+    OPENPOSE_LIST: "std_msgs/Header header\nopenpose_ros2_msgs/PoseKeyPoints[] pose_key_points_list\n",
+    "ros_openpose/msg/Pixel": "float32 x\nfloat32 y\n",
+    "ros_openpose/msg/BodyPart": "float32 score\nros_openpose/Pixel pixel\ngeometry_msgs/Point32 point\n",
+    "ros_openpose/msg/Person": "ros_openpose/BodyPart[] bodyParts\nros_openpose/BodyPart[] leftHandParts\n"
+    "ros_openpose/BodyPart[] rightHandParts\n",
+    OPENPOSE_FRAME: "std_msgs/Header header\nros_openpose/Person[] persons\n",
+}
+
+SIZE = (640, 480)
+
+# The orders, written out a second time on purpose: by the constants and enumerations of the packages' own documents.
+_RIGHT_FIRST = "nose neck RSHO RELB RWRI LSHO LELB LWRI {} RHIP RKNE RANK LHIP LKNE LANK REYE LEYE REAR LEAR"
+_WORDS = {
+    "SHO": "shoulder",
+    "ELB": "elbow",
+    "WRI": "wrist",
+    "HIP": "hip",
+    "KNE": "knee",
+    "ANK": "ankle",
+    "EYE": "eye",
+    "EAR": "ear",
+    "BIG": "big_toe",
+    "SML": "small_toe",
+    "HEE": "heel",
+}
+
+
+def _names(text: str) -> list[str]:
+    """LSHO = left_shoulder; - = a point that the layouts do not have."""
+
+    def name(word: str) -> str:
+        if word[1:] in _WORDS:
+            return {"L": "left_", "R": "right_"}[word[0]] + _WORDS[word[1:]]
+        return word
+
+    return [name(word) for word in text.split()]
+
+
+OPENPOSE18 = _names(_RIGHT_FIRST.format(""))
+BODY25 = _names(_RIGHT_FIRST.format("pelvis") + " LBIG LSML LHEE RBIG RSML RHEE")
+HRI18 = OPENPOSE18[:14] + _names("LEYE REYE LEAR REAR")
+ZED34 = _names(
+    "- - - - - LSHO LELB LWRI - - - - RSHO RELB RWRI - - - LHIP LKNE LANK - RHIP RKNE RANK - "
+    "- nose LEYE LEAR REYE REAR LHEE RHEE"
+)
+ZED38 = _names(
+    "- - - - - nose LEYE REYE LEAR REAR - - LSHO RSHO LELB RELB LWRI RWRI LHIP RHIP LKNE RKNE LANK RANK "
+    "LBIG RBIG LSML RSML LHEE RHEE - - - - - - - -"
+)
+ZED_ORDERS = {0: OPENPOSE18, 1: ZED34, 2: ZED38}
+OPENDR_NAMES = (
+    "nose neck r_sho r_elb r_wri l_sho l_elb l_wri r_hip r_knee r_ank l_hip l_knee l_ank r_eye l_eye r_ear l_ear"
+)
+
+
+class LiveMake:
+    """Attributes as rclpy's messages have them; the packages themselves are not here."""
+
+    def __call__(self, type_name: str, **fields) -> SimpleNamespace:
+        return SimpleNamespace(**fields)
+
+    @staticmethod
+    def floats(values) -> array.array:
+        """A float32[] field."""
+        return array.array("f", values)
+
+    @staticmethod
+    def through_cdr(msg):
+        """It is live: nothing happens to it."""
+        return msg
+
+
+def hri(make, header, pose: dict, confidence: float = 0.9):
+    """One body; points that the pose lacks are as a fresh message has them."""
+    points = [(pose[n][0] / SIZE[0], pose[n][1] / SIZE[1], confidence) if n in pose else (0.0,) * 3 for n in HRI18]
+    return make(HRI, header=header, skeleton=[hri_point(make, *map(float, point)) for point in points])
+
+
+def hri_point(make, x: float, y: float, c: float):
+    return make("hri_msgs/msg/NormalizedPointOfInterest2D", x=x, y=y, c=c)
+
+
+def zed(make, header, poses: list[dict], body_format: int = 2, ids=None):
+    ids = range(len(poses)) if ids is None else ids
+    return make(ZED, header=header, objects=[zed_body(make, p, body_format, i) for p, i in zip(poses, ids)])
+
+
+def zed_body(make, pose: dict, body_format: int, ident: int, skeleton: bool = True):
+    xy = np.zeros((70, 2), np.float32)
+    for slot, name in enumerate(ZED_ORDERS.get(body_format, [])):
+        if name in pose:
+            xy[slot] = pose[name]
+    slots = [make("zed_msgs/msg/Keypoint2Df", kp=kp) for kp in xy]
+    return make(
+        "zed_msgs/msg/Object",
+        label=f"Body_{ident}",
+        label_id=ident,
+        confidence=20.0,
+        skeleton_available=skeleton,
+        body_format=body_format,
+        skeleton_2d=make("zed_msgs/msg/Skeleton2D", keypoints=slots),
+    )
+
+
+def ai(make, header, targets: list):
+    return make(AI, header=header, fps=30, targets=targets, disappeared_targets=[])
+
+
+def ai_target(make, ident: int, **points):
+    """points: type -> (rows of x, y; confidences)."""
+    groups = [
+        make(
+            "ai_msgs/msg/Point",
+            type=kind,
+            point=[make("geometry_msgs/msg/Point32", x=float(x), y=float(y), z=0.0) for x, y in rows],
+            confidence=make.floats(confidence),
+        )
+        for kind, (rows, confidence) in points.items()
+    ]
+    return make("ai_msgs/msg/Target", type="person", track_id=ident, points=groups)
+
+
+def opendr(make, header, pose: dict, ident: int = 1, conf: float = 17.5):
+    """One person; points that the pose lacks are left out."""
+    named = zip(OPENDR_NAMES.split(), OPENPOSE18)
+    return opendr_of(make, header, [(short, *pose[name]) for short, name in named if name in pose], ident, conf)
+
+
+def opendr_of(make, header, rows: list, ident: int = 1, conf: float = 17.5):
+    """rows: (kpt_name, x, y)."""
+    keypoints = [
+        make("opendr_interface/msg/OpenDRPose2DKeypoint", kpt_name=name, x=round(x), y=round(y)) for name, x, y in rows
+    ]
+    return make(OPENDR, header=header, pose_id=ident, conf=conf, keypoint_list=keypoints)
+
+
+def openpose_list(make, header, persons: list):
+    """persons: rows of x, y, score, as openpose_rows() makes them."""
+    lists = [
+        make(
+            "openpose_ros2_msgs/msg/PoseKeyPoints",
+            pose_key_points=[make("openpose_ros2_msgs/msg/PoseKeyPoint", x=x, y=y, score=s) for x, y, s in rows],
+        )
+        for rows in persons
+    ]
+    return make(OPENPOSE_LIST, header=header, pose_key_points_list=lists)
+
+
+def openpose_frame(make, header, persons: list):
+    """As openpose_list, with hands that nobody should take for a body."""
+
+    def part(x, y, score):
+        nowhere = make("geometry_msgs/msg/Point32", x=0.0, y=0.0, z=0.0)
+        pixel = make("ros_openpose/msg/Pixel", x=x, y=y)
+        return make("ros_openpose/msg/BodyPart", score=score, pixel=pixel, point=nowhere)
+
+    hand = [part(1.0, 2.0, 0.9)] * 21
+    people = [
+        make(
+            "ros_openpose/msg/Person",
+            bodyParts=[part(*row) for row in rows],
+            leftHandParts=hand,
+            rightHandParts=hand,
+        )
+        for rows in persons
+    ]
+    return make(OPENPOSE_FRAME, header=header, persons=people)
+
+
+def openpose_rows(pose: dict, order: list[str], score: float = 0.8) -> list:
+    return [(float(pose[n][0]), float(pose[n][1]), score) if n in pose else (0.0, 0.0, 0.0) for n in order]
