@@ -155,6 +155,14 @@ class Trainer:
         return self.regression_steps + self.recipe.steps
 
     @property
+    def _lesson_steps(self) -> int:
+        """Steps of this generation before those of the objective.
+
+        Later ones begin with shapes better than they give for long: renewed too soon, these would be lost.
+        """
+        return self.regression_steps if self.step < self._steps_each else self._steps_each // 2
+
+    @property
     def _own_step(self) -> int:
         """Steps that this generation has done."""
         return self.step % self._steps_each
@@ -317,13 +325,13 @@ class Trainer:
         if phase != REGRESSION and self.recipe.patience:
             self.stopped = self._settled(loss)
         row = self._row(terms, self.recipe.learning_rate * factor, phase)
-        if self.step % _LOG_EVERY == 0 or self._own_step in (0, self.regression_steps) or self.finished:
+        if self.step % _LOG_EVERY == 0 or self._own_step in (0, self._lesson_steps) or self.finished:
             self.rows.append(row)
         return dict(zip(LOG_COLUMNS, row))
 
     def _phase(self) -> str:
         """Of the step to come."""
-        if self._own_step < self.regression_steps:
+        if self._own_step < self._lesson_steps:
             return REGRESSION
         return HELD if self.recipe.hold else UNSUPERVISED
 
@@ -331,7 +339,7 @@ class Trainer:
         """Whether the next step is the first one after the lesson: a generation's first, or when a hold ends."""
         if phase == REGRESSION:
             return self.step > 0 and self._own_step == 0
-        return phase == HELD and (self._own_step - self.regression_steps) % self.recipe.hold == 0
+        return phase == HELD and (self._own_step - self._lesson_steps) % self.recipe.hold == 0
 
     @torch.no_grad()
     def _held(self, phase: str) -> Lesson:
@@ -383,12 +391,20 @@ class Trainer:
         return total / count > (1 - _SETTLED) * before
 
     def _rate_factor(self) -> float:
-        """Of all learning rates: a warm-up and a cosine to zero in either phase."""
-        first = self._own_step < self.regression_steps
-        step = self._own_step if first else self._own_step - self.regression_steps
-        steps = self.regression_steps if first else self.recipe.steps
+        """Of all learning rates: a warm-up and a cosine to zero in either phase.
+
+        With held solutions both phases are one, for they do the same; and half of it is at the full rate, as a solution
+        that is renewed late has to be learned anew.
+        """
+        if self.recipe.hold:
+            step, steps = self._own_step, self._steps_each
+            done = max(0.0, 2 * step / steps - 1)
+        else:
+            first = self._own_step < self.regression_steps
+            step = self._own_step if first else self._own_step - self.regression_steps
+            done = step / (self.regression_steps if first else self.recipe.steps)
         warm_up = min(1.0, (step + 1) / _WARM_UP_STEPS)
-        return float(warm_up * 0.5 * (1 + np.cos(np.pi * step / steps)))
+        return float(warm_up * 0.5 * (1 + np.cos(np.pi * done)))
 
     def _batch(self, phase: str) -> tuple[Views, Tensor, Tensor | None, Share]:
         """This process's share of a batch: views, frame numbers, and in the first phase the shapes to be learned.
