@@ -67,7 +67,7 @@ class Record:
 def read_messages(path: str | Path, topics: Any = None) -> Iterator[tuple[str, str, Any, int]]:
     """Messages of a bag in file order: (topic, type name, decoded message, log time in ns).
 
-    path: an .mcap file or a rosbag2 folder; topics: only these, None for all.
+    path: an .mcap file or a rosbag2 folder; topics: only these, as matches() takes them, None for all.
     Types need not be installed: the definitions in the bag are used. Raises BagError, for a damaged file after
     everything before the damage was yielded.
     """
@@ -80,6 +80,13 @@ def read_records(path: str | Path, topics: Any = None) -> Iterator[Record]:
     wanted = None if topics is None else frozenset(topics)
     for file in _files(Path(path)):
         yield from _read_file(file, wanted)
+
+
+@lru_cache(maxsize=1024)
+def matches(topic: str, name: str) -> bool:
+    """Whether a topic is the one of that name, in which * stands for any one part between slashes."""
+    parts, wanted = topic.split("/"), name.split("/")
+    return len(parts) == len(wanted) and all(want in ("*", part) for part, want in zip(parts, wanted))
 
 
 def topics_of(path: str | Path) -> dict[str, tuple[str, int]]:
@@ -314,7 +321,7 @@ def _read_file(file: Path, wanted: frozenset | None) -> Iterator[Record]:
             size = _check_start(stream, file)
             for opcode, body in _records(stream, size):
                 for record in _messages_in(opcode, body, state):
-                    if wanted is None or record.topic in wanted:
+                    if wanted is None or any(matches(record.topic, name) for name in wanted):
                         yield record
     except BagError:
         raise

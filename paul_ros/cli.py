@@ -57,7 +57,11 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--model", help="name of a shipped model, or a .npz (default: the shipped human model)")
     parser.add_argument("--layout", help="layout of the bag's keypoints: a name or a .yaml (default: the model's)")
-    parser.add_argument("--topic", default="/keypoints", help="2D keypoints (default: %(default)s)")
+    parser.add_argument(
+        "--topic",
+        default="/keypoints",
+        help="2D keypoints (default: %(default)s); * is any part of a name, as in '/humans/bodies/*/skeleton2d'",
+    )
     parser.add_argument(
         "--camera-info-topic",
         default="/camera_info",

@@ -20,12 +20,22 @@ import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D
 from msg_adapters.keypoints import stamp_ns
 from paul_ros import __version__, metrics
-from paul_ros.bag import LATCHED_QOS, BagError, BagMessages, BagWriter, Record, check_outputs, read_records, topics_of
+from paul_ros.bag import (
+    LATCHED_QOS,
+    BagError,
+    BagMessages,
+    BagWriter,
+    Record,
+    check_outputs,
+    matches,
+    read_records,
+    topics_of,
+)
 from paul_ros.lifter import AMBIGUOUS, Lifted, Lifter
 from paul_ros.model import load_model
 from paul_ros.parameters import PARAMETERS
 from paul_ros.skeleton import Mapping, load_layout
-from paul_ros.stream import LiftStream
+from paul_ros.stream import Frame, LiftStream
 
 NODE = "/lifter"
 """Output topics lie below this name, as those of the node of that name do."""
@@ -54,7 +64,10 @@ class WrongTopic(BagError):
 
 @dataclass(frozen=True)
 class Topics:
-    """What is read from the bag; the defaults are those of the bags in bags/."""
+    """What is read from the bag; the defaults are those of the bags in bags/.
+
+    keypoints may have * for a part of its name, for families with a topic a person: /humans/bodies/*/skeleton2d.
+    """
 
     keypoints: str = "/keypoints"
     camera_info: str = "/camera_info"
@@ -126,7 +139,9 @@ def replay(
             for record in read_records(bag, topics.all):
                 if shell.take(record):
                     on_frame()
+            shell.finish()
         except BagError as error:
+            shell.finish()
             if not done.frames or isinstance(error, WrongTopic):
                 raise
             done.damage = error
@@ -143,12 +158,13 @@ class _Shell:
         self.keypoint_messages = 0
         self._make = BagMessages()
         self._described: dict = {}
+        self._last_time = 0
 
     def take(self, record: Record) -> bool:
         """True where the record was a keypoint message."""
         if self.writer:
             self.writer.write_record(record)
-        if record.topic == self.topics.keypoints:
+        if matches(record.topic, self.topics.keypoints):
             self._take_keypoints(record)
             return True
         if record.topic == self.topics.camera_info:
@@ -159,15 +175,24 @@ class _Shell:
 
     def _take_keypoints(self, record: Record) -> None:
         self.keypoint_messages += 1
-        stream = self.done.stream
-        frame = stream.keypoints(record.type_name, _decoded(record, "keypoints", *msg_adapters.SUPPORTED))
+        message = _decoded(record, "keypoints", *msg_adapters.SUPPORTED)
+        frame = self.done.stream.keypoints(record.type_name, message, record.topic)
+        self._last_time = record.log_time
         self._write_layout(record.log_time)
+        self._take_frame(frame)
+
+    def finish(self) -> None:
+        """Takes what the stream has kept for more persons of the last image."""
+        self._take_frame(self.done.stream.flush())
+
+    def _take_frame(self, frame: Frame | None) -> None:
         if frame is None:
             return
-        self.done.frames.append(LiftedFrame(frame.keypoints.stamp, frame.keypoints, frame.lifted, stream.intrinsics))
+        camera = self.done.stream.intrinsics
+        self.done.frames.append(LiftedFrame(frame.keypoints.stamp, frame.keypoints, frame.lifted, camera))
         if self.writer:
             for name, message in frame.messages(self._make).items():
-                self.writer.write(f"{NODE}/{name}", message, record.log_time)
+                self.writer.write(f"{NODE}/{name}", message, self._last_time)
 
     def _take_truth(self, message: object) -> None:
         stream = self.done.stream

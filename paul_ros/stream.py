@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import msg_adapters
-from msg_adapters import Intrinsics, Keypoints2D, MessageError, WrongPointCount, outputs
+from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, outputs
 from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
 from paul_ros.skeleton import Layout, layout_names, load_layout
 
@@ -86,7 +86,10 @@ OUTPUTS = {
 
 
 class LiftStream:
-    """Lifts a stream of 2D keypoint messages, one message at a time and each for itself.
+    """Lifts a stream of 2D keypoint messages, one image at a time and each for itself.
+
+    Of most types a message is an image. Where it is one person, those of one stamp are lifted together as soon as a
+    message of another stamp tells that they are all, or flush() does.
 
     counts: frames, persons, lifted. drops: reason -> how many messages, or persons ('person_...').
     notes: what was odd but used, as 'stamp_backwards'. explanations: reason -> what to do about the last one.
@@ -107,6 +110,8 @@ class LiftStream:
         self.lift_us: deque[float] = deque(maxlen=_TIMES_KEPT)
         self._mapping = layout.map_to(lifter.model.layout)
         self._last_stamp: int | None = None
+        self._image_size: tuple[int, int] | None = None
+        self._gathered = _Gathered()
 
     @property
     def units(self) -> str:
@@ -117,6 +122,8 @@ class LiftStream:
     def camera_info(self, msg) -> None:
         """Takes the intrinsics; of an unusable CameraInfo nothing is taken and the drop is counted."""
         with self.guard():
+            # A camera that is not calibrated has a size too.
+            self._image_size = (int(msg.width), int(msg.height))
             self.intrinsics = msg_adapters.read_camera_info(msg)
             if self.intrinsics.distorted:
                 self.notes["distorted_image"] += 1
@@ -125,11 +132,36 @@ class LiftStream:
                     "keypoints are of an undistorted image; let the camera's driver fill P and rectify the image"
                 )
 
-    def keypoints(self, type_name: str, msg) -> Frame | None:
-        """Lifts one message; None = dropped, counted and explained. Zero persons are a frame too."""
+    def keypoints(self, type_name: str, msg, topic: str = "") -> Frame | None:
+        """Lifts one message; None = dropped, counted and explained. Zero persons are a frame too.
+
+        A message of one person is kept, which gives None too, or the frame of the image before.
+        topic: that it came from; some families have the person's id there.
+        """
         with self.guard():
-            return self._frame(msg.header, self._read(type_name, msg))
+            keypoints = self._read(type_name, msg, topic)
+            # Without a stamp nothing tells which persons are of one image.
+            if type_name in msg_adapters.ONE_PERSON and keypoints.stamp:
+                return self._gather(msg.header, keypoints)
+            return self._frame(msg.header, keypoints)
         return None
+
+    def flush(self) -> Frame | None:
+        """Lifts the persons that are kept, when no more will come; None where there are none."""
+        with self.guard():
+            if self._gathered.parts:
+                return self._frame(*self._gathered.take())
+        return None
+
+    def _gather(self, header, keypoints: Keypoints2D) -> Frame | None:
+        """Keeps one person; the frame of those of the image before, where this one tells that they are all."""
+        complete = None
+        if self._gathered.takes(keypoints):
+            self._check_persons(len(self._gathered.parts) + keypoints.persons)
+        else:
+            complete = self._gathered.take()
+        self._gathered.add(header, keypoints)
+        return self._frame(*complete) if complete else None
 
     @contextlib.contextmanager
     def guard(self):
@@ -163,15 +195,19 @@ class LiftStream:
             "metres_per_unit": model.metres_per_unit,
         }
 
-    def _read(self, type_name: str, msg) -> Keypoints2D:
-        keypoints = msg_adapters.read(type_name, msg, len(self.layout.names))
-        if keypoints.persons > self.max_persons:
+    def _read(self, type_name: str, msg, topic: str) -> Keypoints2D:
+        names = self.layout.names
+        keypoints = msg_adapters.read(type_name, msg, len(names), Source(names, self._image_size, topic))
+        self._check_persons(keypoints.persons)
+        return self._in_model_layout(keypoints)
+
+    def _check_persons(self, persons: int) -> None:
+        if persons > self.max_persons:
             raise MessageError(
                 "too_many_persons",
-                f"{keypoints.persons} persons in one message; if that is "
+                f"{persons} persons in one image; if that is "
                 f"right, raise the parameter `max_persons` above {self.max_persons}",
             )
-        return self._in_model_layout(keypoints)
 
     def _in_model_layout(self, keypoints: Keypoints2D) -> Keypoints2D:
         sure = keypoints.visible & (keypoints.confidence >= self.min_confidence)
@@ -202,6 +238,36 @@ class LiftStream:
     def _drop(self, reason: str, explanation: str) -> None:
         self.drops[reason] += 1
         self.explanations[reason] = explanation
+
+
+class _Gathered:
+    """Persons of one image that come in a message each.
+
+    header: of the last of them; stamp and frame are those of all. parts: what was read of each.
+    """
+
+    def __init__(self) -> None:
+        self.header: object = None
+        self.parts: list[Keypoints2D] = []
+
+    def takes(self, keypoints: Keypoints2D) -> bool:
+        """Whether this person is of the same image: same stamp and frame, and not one that it has already."""
+        if not self.parts:
+            return True
+        first = self.parts[0]
+        known = {name for part in self.parts for name in part.ids if name}
+        same = (keypoints.stamp, keypoints.frame_id) == (first.stamp, first.frame_id)
+        return same and not known.intersection(keypoints.ids)
+
+    def add(self, header, keypoints: Keypoints2D) -> None:
+        """One person more."""
+        self.header = header
+        self.parts.append(keypoints)
+
+    def take(self) -> tuple[object, Keypoints2D]:
+        """Header and all persons, in the order they came; then there is nobody."""
+        parts, self.parts = self.parts, []
+        return self.header, msg_adapters.join(parts)
 
 
 def _scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) -> str:

@@ -13,7 +13,9 @@ import time
 import numpy as np
 import pytest
 from conftest import ROOT, LifterProcess, RosMake, camera_info, header_of, persons_at, seen
+from foreign_messages import DEFINITIONS as FOREIGN
 
+import msg_adapters
 from msg_adapters import outputs
 from paul_ros import parameters
 from paul_ros.stream import OUTPUTS
@@ -411,6 +413,15 @@ def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, mod
     bench.until(lambda: "yolo_msgs" in lifter.log(), "the warning")
     assert "install it" in lifter.log()
     bench.close()
+
+
+@pytest.mark.parametrize("type_name", sorted(set(FOREIGN) & set(msg_adapters.SUPPORTED)))
+def test_every_foreign_package_that_is_missing_is_named(type_name):
+    """The node's warning is made of this error."""
+    from paul_ros.node import message_class
+
+    with pytest.raises(ImportError, match=type_name.split("/")[0]):
+        message_class(type_name)
 
 
 def refused(lifter: LifterProcess) -> str:
