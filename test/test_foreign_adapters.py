@@ -6,9 +6,9 @@ from __future__ import annotations
 import foreign_messages as foreign
 import numpy as np
 import pytest
-from conftest import header_of
+from conftest import ROOT, header_of
 
-from msg_adapters import MessageError, Source, WrongPointCount, hri, openpose, read, zed
+from msg_adapters import SUPPORTED, MessageError, Source, WrongPointCount, hri, openpose, read, zed
 from paul_ros.skeleton import layout_names, load_layout
 
 COCO = load_layout("coco17").names
@@ -344,6 +344,11 @@ def every_message(make) -> dict:
 @pytest.mark.parametrize("names", [("hinge", "handle", "corner"), ()])
 def test_a_layout_of_another_thing_is_refused(make, type_name, names):
     assert reason_of(make, type_name, every_message(make)[type_name], names) == "no_common_names"
+
+
+def test_the_readme_tells_every_type_that_can_be_read():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert [name for name in SUPPORTED if f"`{name.replace('/msg/', '/')}`" not in text] == []
 
 
 def test_orders_are_those_of_the_shipped_layouts():
