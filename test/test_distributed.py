@@ -32,9 +32,12 @@ TORCHRUN = [
 ]
 
 
-def train_together(data, model, layout):
+HELD = {**RECIPE, "hold": 8, "generations": 2}
+
+
+def train_together(data, model, layout, recipe=RECIPE):
     """``torchrun -m paul_ros.cli train`` with two processes."""
-    settings = [word for key, value in RECIPE.items() for word in ("--set", f"{key}={value}")]
+    settings = [word for key, value in recipe.items() for word in ("--set", f"{key}={value}")]
     command = [sys.executable, *TORCHRUN, "-m", "paul_ros.cli", "train", data, "-o", model, "--layout", layout]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
     words = [*map(str, command), *settings, "--quiet"]
@@ -43,14 +46,15 @@ def train_together(data, model, layout):
     return done
 
 
-def test_two_processes_train_as_one(tmp_path, monkeypatch):
+@pytest.mark.parametrize("settings, logged", [(RECIPE, [10, 30]), (HELD, [10, 30, 45, 60])], ids=["joint", "held"])
+def test_two_processes_train_as_one(tmp_path, monkeypatch, settings, logged):
     """They take up a run of one process, with its start, in the first phase; nine frames a step, so shares differ.
 
     Bones, handedness and nuclear norm are of the whole batch.
     """
     torch.set_num_threads(1)
     np.savez(tmp_path / "views.npz", W=sequence(layout=COCO)[0].W)
-    data, recipe = load_training_data(tmp_path / "views.npz", COCO), Recipe.from_dict(RECIPE)
+    data, recipe = load_training_data(tmp_path / "views.npz", COCO), Recipe.from_dict(settings)
     monkeypatch.setattr(starting, "search", lambda *given: true_start(*sequence(layout=COCO)))
     one = Trainer(data, recipe, tmp_path / "one.run")
     for row in one.run():
@@ -59,11 +63,11 @@ def test_two_processes_train_as_one(tmp_path, monkeypatch):
             one.folder = tmp_path / "two.run"
             one.save()
             one.folder = tmp_path / "one.run"
-    done = train_together(tmp_path / "views.npz", tmp_path / "two.npz", "coco17")
+    done = train_together(tmp_path / "views.npz", tmp_path / "two.npz", "coco17", settings)
     assert "continuing at step 5" in done.stderr and done.stdout.count("two.npz") == 1  # one of them talks
     two = Trainer(data, recipe, tmp_path / "two.run")
     assert two.resume() and two.finished
-    assert [row[0] for row in two.rows] == [row[0] for row in one.rows] == [10, 30]
+    assert [row[0] for row in two.rows] == [row[0] for row in one.rows] == logged
     for a, b in zip(one.rows, two.rows):
         first, second = (dict(zip(LOG_COLUMNS, row)) for row in (a, b))
         for name in LOG_COLUMNS[2:9]:

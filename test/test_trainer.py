@@ -160,6 +160,19 @@ def test_the_next_generation_starts_afresh_from_what_the_last_explained_best(tmp
     assert max(moved) > 0.1  # a step of Adam's would be a thousandth at most
 
 
+def test_rates_stay_high_for_half_a_generation_of_held_solutions(tmp_path):
+    settings = {"regression_steps": 400, "steps": 1600, "generations": 2}
+    run = Trainer(sequence()[0], Recipe.from_dict({**HELD, **settings}), tmp_path / "held")
+    rates = []
+    for run.step in range(run.steps):
+        rates.append(run._rate_factor())
+    assert rates[:2000] == rates[2000:] and rates[0] < 0.01
+    assert set(rates[200:1001]) == {1.0} and rates[1500] == pytest.approx(0.5) and rates[1999] < 1e-5
+    run = Trainer(sequence()[0], Recipe.from_dict({**HELD, **settings, "generations": 1, "hold": 0}), tmp_path)
+    for run.step, rate in ((300, 0.5 * (1 + np.cos(np.pi * 0.75))), (400, 0.005), (1200, 0.5)):
+        assert run._rate_factor() == pytest.approx(rate)
+
+
 def test_a_start_is_of_the_chirality_that_the_layout_asks_for(tmp_path, monkeypatch):
     data, camera, R = sequence(layout=COCO)
     true = true_start(data, camera, R)
