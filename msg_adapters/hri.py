@@ -25,7 +25,7 @@ NAMES = (
 )
 # fmt: on
 _TOPIC = re.compile(r"/humans/bodies/([^/]+)/skeleton2d")
-#: A detector may guess a point outside of the image, but not by more than another image.
+#: Detectors guess points outside of the image; one that is more than another image away is not worth having.
 _LEAST, _MOST = -1.0, 2.0
 
 
@@ -41,20 +41,21 @@ def read(msg, points: int, source: Source) -> Keypoints2D:
             "wrong_skeleton_size",
             f"the skeleton has {len(shares)} keypoints; hri_msgs/Skeleton2D has {len(NAMES)}, whatever was not seen",
         )
-    present = shares[:, 2] > 0
-    _check(shares[present, :2])
-    shares[~present] = np.nan
+    seen = shares[:, 2] > 0
+    far = ((shares[:, :2] < _LEAST) | (shares[:, :2] > _MOST)).any(axis=1)
+    _check(seen, far)
+    shares[far | ~seen] = np.nan
     placed = by_name(shares, NAMES, source.names)[None]
     return record(placed[..., :2] * _size(source), placed[..., 2], (_body_id(source.topic),), msg.header)
 
 
-def _check(xy: np.ndarray) -> None:
-    # Comparisons with NaN are false.
-    if ((xy < _LEAST) | (xy > _MOST)).any():
+def _check(seen: np.ndarray, far: np.ndarray) -> None:
+    """One point may be far off; where most are, they are pixels."""
+    if 2 * (seen & far).sum() > seen.sum():
         raise MessageError(
             "not_normalised",
-            f"a keypoint is at {np.nanmax(np.abs(xy)):g}, which is no share of the image; hri_msgs has x and y in "
-            "0..1, so divide pixels by the image's width and height",
+            f"{(seen & far).sum()} of {seen.sum()} keypoints are no shares of the image; hri_msgs has x and y in 0..1, "
+            "so divide pixels by the image's width and height",
         )
 
 

@@ -100,8 +100,11 @@ def test_hri_odd_points(make, point, visible):
 
 @pytest.mark.parametrize("x, y", [(320.0, 0.5), (0.5, 240.0), (-1.5, 0.5), (np.inf, 0.5)])
 def test_hri_pixels_where_shares_should_be_are_refused(make, x, y):
+    """As long as half of the points are shares, the others are a detector's wild guesses and count as missing."""
     msg = foreign.hri(make, header_of(make), POSE)
-    msg.skeleton[3] = foreign.hri_point(make, x, y, 0.9)
+    msg.skeleton[:9] = [foreign.hri_point(make, x, y, 0.9)] * 9
+    assert_pose(read_of(make, foreign.HRI, msg), COCO, foreign.HRI18[9:])
+    msg.skeleton[9] = foreign.hri_point(make, x, y, 0.9)
     assert reason_of(make, foreign.HRI, msg) == "not_normalised"
 
 
