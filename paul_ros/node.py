@@ -29,6 +29,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -43,13 +44,15 @@ from paul_ros.lifter import Lifter
 from paul_ros.model import ModelError, load_model
 from paul_ros.parameters import PARAMETERS, Parameter, as_markdown
 from paul_ros.skeleton import LayoutError, load_layout
-from paul_ros.stream import OUTPUTS, LiftStream
+from paul_ros.stream import OUTPUTS, Frame, LiftStream
 
 #: Matches every publisher; a few frames deep, so that a hiccup of the scheduler loses none.
 _INPUT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 _OUTPUT_QOS = QoSProfile(depth=10)
 _LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _LOOK_SECONDS = 0.2
+#: Detectors that send a message a person send those of one image in one go: two such silences tell that they are all.
+_SILENCE_SECONDS = 0.005
 _WARN_SECONDS = 5.0
 #: An idle node looks this often whether a signal asked it to end.
 _STOP_SECONDS = 0.2
@@ -103,6 +106,10 @@ class LifterNode(Node):
         self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, _INPUT_QOS)
         self._publish_layout()
         self._look_timer = self.create_timer(_LOOK_SECONDS, self._look_for_input)
+        # Steady: a simulation that stands still would hold the last image back.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._silence_timer = self.create_timer(_SILENCE_SECONDS, self._on_silence, clock=steady, autostart=False)
+        self._silences = 0
         self.create_timer(1.0, self._publish_diagnostics)
 
     def summary(self) -> str:
@@ -183,7 +190,23 @@ class LifterNode(Node):
 
     def _on_keypoints(self, msg, info: dict) -> None:
         self._count_missed(info["publication_sequence_number"])
-        frame = self.stream.keypoints(self._input_type, msg)
+        self._take(self.stream.keypoints(self._input_type, msg, self._topic))
+        if self._input_type in msg_adapters.ONE_PERSON:
+            self._silences = 0
+            self._silence_timer.reset()
+
+    def _on_silence(self) -> None:
+        """Flushes at the second tick: at the first, if this process was kept from running, a message may be waiting."""
+        self._silences += 1
+        if self._silences == 2:
+            self._silence_timer.cancel()
+            self.flush()
+
+    def flush(self) -> None:
+        """Lifts and publishes the persons that the stream keeps for more of their image."""
+        self._take(self.stream.flush())
+
+    def _take(self, frame: Frame | None) -> None:
         if frame is not None:
             with self.stream.guard():
                 self._publish(frame)
@@ -200,7 +223,7 @@ class LifterNode(Node):
             self.stream.drops["missed"] += missed
             self.stream.explanations["missed"] = "Lost on the way, or newer came before they could be lifted"
 
-    def _publish(self, frame) -> None:
+    def _publish(self, frame: Frame) -> None:
         """Builds what somebody listens to and then publishes it, so that a fault leaves no half frame."""
         built = [
             (publisher, frame.message(name, self._make))
@@ -371,6 +394,7 @@ def _spin(node: LifterNode, stop: threading.Event) -> None:
     executor.add_node(node)
     while rclpy.ok() and not stop.is_set():
         executor.spin_once(timeout_sec=_STOP_SECONDS)
+    node.flush()
 
 
 if __name__ == "__main__":

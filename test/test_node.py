@@ -8,16 +8,19 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 from conftest import ROOT, LifterProcess, RosMake, camera_info, header_of, persons_at, seen
 from foreign_messages import DEFINITIONS as FOREIGN
+from foreign_messages import HRI, OPENDR, LiveMake, hri, opendr
 
 import msg_adapters
 from msg_adapters import outputs
 from paul_ros import parameters
+from paul_ros.skeleton import load_layout
 from paul_ros.stream import OUTPUTS
 
 MAKE = RosMake()
@@ -531,6 +534,87 @@ def test_a_fault_in_building_leaves_no_half_frame(ros, lifter_node):
         ros.spin_once(listener, timeout_sec=0.02)
     assert len(got) == 3
     listener.destroy_node()
+
+
+#: The packages of messages of one person are on no index, so these are handed to the node; all else is real.
+POSES = [dict(zip(load_layout("coco17").names, xy.tolist())) for xy in seen(persons_at((0.3, 0, 4), (-1, 0, 5)))]
+
+
+def one_person(node, build, seconds: int, **person) -> None:
+    node._on_keypoints(build(LiveMake(), header_of(MAKE, seconds), **person), {"publication_sequence_number": 0})
+
+
+@pytest.fixture
+def poses_of_node(ros, lifter_node):
+    """Spins the node and a listener to its poses: poses_of_node(condition, what) -> those that came until then."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    got, listener = [], ros.create_node("listener")
+    listener.create_subscription(class_of(OUTPUTS["poses"]), "/lifter/poses", got.append, 10)
+    executor = SingleThreadedExecutor()
+    executor.add_node(lifter_node)
+
+    def until(condition, what: str) -> list:
+        end = time.monotonic() + PATIENCE
+        while not condition(got):
+            assert time.monotonic() < end, f"never came: {what}"
+            executor.spin_once(timeout_sec=0.02)
+            ros.spin_once(listener, timeout_sec=0)
+        return got
+
+    until(lambda _: lifter_node._outputs["poses"].get_subscription_count(), "the listener")
+    yield until
+    executor.shutdown()
+    listener.destroy_node()
+
+
+def test_persons_in_a_message_each_are_published_when_no_more_come(lifter_node, poses_of_node):
+    lifter_node._input_type = OPENDR
+    for ident, pose in enumerate(POSES, 1):
+        one_person(lifter_node, opendr, 1, pose=pose, ident=ident)
+    assert lifter_node.stream.counts["frames"] == 0
+    (image,) = poses_of_node(bool, "the image without a next one")
+    assert (image.header.stamp.sec, len(image.poses)) == (1, 2 * 17)
+    one_person(lifter_node, opendr, 2, pose=POSES[0], ident=1)
+    _, image = poses_of_node(lambda got: len(got) == 2, "one more image")
+    assert (image.header.stamp.sec, len(image.poses)) == (2, 17)
+    assert lifter_node._silence_timer.is_canceled()
+    assert lifter_node.stream.counts == dict(frames=2, persons=3, lifted=3) and not lifter_node.stream.drops
+
+
+def test_a_node_kept_from_running_between_two_persons_tears_no_image(lifter_node, poses_of_node):
+    """Timers come before messages: the first late tick finds the second person still waiting."""
+    lifter_node._input_type = OPENDR
+    one_person(lifter_node, opendr, 1, pose=POSES[0], ident=1)
+    time.sleep(0.05)
+    lifter_node._on_silence()
+    one_person(lifter_node, opendr, 1, pose=POSES[1], ident=2)
+    (image,) = poses_of_node(bool, "the image")
+    assert len(image.poses) == 2 * 17 and lifter_node.stream.counts["frames"] == 1
+
+
+def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
+    from paul_ros.node import _spin
+
+    lifter_node._input_type = OPENDR
+    one_person(lifter_node, opendr, 1, pose=POSES[0])
+    stop = threading.Event()
+    stop.set()
+    _spin(lifter_node, stop)
+    assert "1 frames, 1 of 1 persons lifted" in lifter_node.summary()
+    (image,) = poses_of_node(bool, "the image")
+    assert len(image.poses) == 17
+
+
+def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):
+    published = []
+    monkeypatch.setattr(lifter_node, "_topic", "/humans/bodies/anna/skeleton2d")
+    monkeypatch.setattr(lifter_node, "_input_type", HRI)
+    monkeypatch.setattr(lifter_node, "_publish", published.append)
+    lifter_node._on_camera_info(camera_info(MAKE))
+    one_person(lifter_node, hri, 1, pose=POSES[0])
+    lifter_node.flush()
+    assert [frame.keypoints.ids for frame in published] == [("anna",)]
 
 
 def test_parameter_file_and_table_come_from_one_place():
