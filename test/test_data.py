@@ -5,9 +5,14 @@ import hashlib
 
 import numpy as np
 import pytest
+from conftest import camera_info
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_foreign_bags import BODIES, FRAMES, IDS, PIXELS, Factory, image_messages, topics_for, write
 
+from msg_adapters import read_camera_info
+from paul_ros.bag import BagWriter
+from paul_ros.placement import centred_view
 from paul_ros.skeleton import load_layout
 from training import data as module
 from training.data import DataError, check_sizes, load_training_data
@@ -166,3 +171,65 @@ def test_the_image_unit_is_the_rms_coordinate(tmp_path, monkeypatch, block):
     for w, seen in zip(data.W.astype(float), data.visible):
         coordinates.append((w[:, seen] - w[:, seen].mean(1, keepdims=True)).ravel())
     assert data.image_unit == pytest.approx(np.sqrt((np.concatenate(coordinates) ** 2).mean()), rel=1e-6)
+
+
+# --- bags of every message family
+
+
+def rays() -> np.ndarray:
+    """(F,2,17) what all those bags show, as the camera that is in them sees it."""
+    xy = PIXELS.reshape(-1, 17, 2)
+    return centred_view(xy, np.ones(xy.shape[:2], bool), read_camera_info(camera_info(Factory()))).W
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_a_bag_of_every_family_is_data(tmp_path, name):
+    data = load_training_data(write(tmp_path / "in.mcap", name), topic=topics_for(name).keypoints)
+    assert data.calibrated and data.visible.all() and data.left_out == 0 and data.layout == load_layout("coco17")
+    np.testing.assert_allclose(data.W, rays(), atol=1e-5)
+
+
+def test_a_bag_without_a_camera_gives_pixels_but_no_shares(tmp_path):
+    data = load_training_data(write(tmp_path / "opendr.mcap", "opendr", with_camera=False))
+    assert not data.calibrated
+    np.testing.assert_array_equal(data.W, PIXELS.reshape(-1, 17, 2).transpose(0, 2, 1))
+    with pytest.raises(DataError, match="no 2D keypoints .*CameraInfo") as caught:
+        load_training_data(write(tmp_path / "hri.mcap", "hri", with_camera=False), topic=BODIES)
+    assert "\n" not in str(caught.value)
+
+
+def write_shares(path, *infos):
+    """A ROS4HRI bag whose CameraInfo comes last."""
+    with BagWriter(path, Factory()) as bag:
+        for number in range(FRAMES):
+            for topic, message in image_messages(Factory(), "hri", number):
+                bag.write(topic, message, number)
+        for info in infos:
+            bag.write("/camera_info", info, FRAMES)
+    return path
+
+
+def test_shares_before_the_first_camera_info_are_no_loss(tmp_path):
+    data = load_training_data(write_shares(tmp_path / "in.mcap", camera_info(Factory())), topic=BODIES)
+    np.testing.assert_allclose(data.W, rays(), atol=1e-5)
+
+
+def test_the_size_of_an_uncalibrated_camera_turns_shares_into_pixels(tmp_path):
+    data = load_training_data(write_shares(tmp_path / "in.mcap", camera_info(Factory(), fx=0.0)), topic=BODIES)
+    assert not data.calibrated
+    np.testing.assert_allclose(data.W, PIXELS.reshape(-1, 17, 2).transpose(0, 2, 1), atol=1e-3)
+
+
+def test_cameras_of_two_sizes_are_refused(tmp_path):
+    other = camera_info(Factory(), fx=0.0)
+    other.width = 1280
+    with pytest.raises(DataError, match="2 cameras"):
+        load_training_data(write_shares(tmp_path / "in.mcap", camera_info(Factory()), other), topic=BODIES)
+
+
+def test_of_several_bodies_one_or_all_must_be_chosen(tmp_path):
+    bag = write(tmp_path / "in.mcap", "hri")
+    with pytest.raises(DataError, match="/humans/bodies/anna/skeleton2d, /humans/bodies/ben/.*--topic"):
+        load_training_data(bag)
+    anna = load_training_data(bag, topic=BODIES.replace("*", "anna"))
+    np.testing.assert_allclose(anna.W, rays()[::2], atol=1e-5)

@@ -134,7 +134,8 @@ def load_training_data(
             message type that has an adapter, calibrated where it holds a CameraInfo.
         layout: what the points are; None: coco17 for 17 points and for bags, else an anonymous one, with ``edges``
             (E,2) of the npz where it has them.
-        topic: which topic of a bag; needed only where it has several.
+        topic: which topic of a bag; needed only where it has several. It may have * for a part of its name, for
+            families with a topic a person: /humans/bodies/*/skeleton2d.
         min_confidence: keypoints of a bag with a lower one count as hidden, as in the node.
 
     Raises:
@@ -228,24 +229,49 @@ def _bag_keypoints(
     path: Path, layout: Layout, topic: str | None
 ) -> tuple[dict[str, list[msg_adapters.Keypoints2D]], msg_adapters.Intrinsics | None, str]:
     """Keypoint messages by topic, the camera, and why messages were refused, the last of every topic."""
-    from paul_ros.bag import read_messages  # needs the extra "bags"
+    from paul_ros.bag import matches, read_records  # needs the extra "bags"
 
+    camera, size, refused = _bag_camera(path)
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
-    refused: dict[str, str] = {}
-    cameras: set[msg_adapters.Intrinsics] = set()
-    for name, type_name, message, _ in read_messages(path):
+    for record in read_records(path):
+        name, type_name = record.topic, record.type_name
+        if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
+            continue
+        source = msg_adapters.Source(layout.names, size, name)
         try:
-            if type_name == "sensor_msgs/msg/CameraInfo":
-                cameras.add(msg_adapters.read_camera_info(message))
-            elif type_name in msg_adapters.SUPPORTED and topic in (None, name):
-                seen = msg_adapters.read(type_name, message, len(layout.names))
-                if seen.persons:
-                    frames.setdefault(name, []).append(seen)
+            seen = msg_adapters.read(type_name, record.message(), len(layout.names), source)
         except msg_adapters.MessageError as error:
             refused[name] = str(error)
-    if len(cameras) > 1:
-        raise DataError(f"'{path}' has CameraInfo of {len(cameras)} cameras: keep that of the keypoints only")
-    return frames, cameras.pop() if cameras else None, _told(refused)
+        else:
+            if seen.persons:
+                frames.setdefault(topic or name, []).append(seen)
+    return frames, camera, _told(refused)
+
+
+def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, int] | None, dict[str, str]]:
+    """The camera, the size of its image and, by topic, why a CameraInfo was refused.
+
+    Read before the keypoints: some are shares of the image, and the first of them may come before any CameraInfo.
+    """
+    from paul_ros.bag import read_records
+
+    refused: dict[str, str] = {}
+    cameras: set[msg_adapters.Intrinsics] = set()
+    sizes: set[tuple[int, int]] = set()
+    for record in read_records(path):
+        if record.type_name != "sensor_msgs/msg/CameraInfo":
+            continue
+        info = record.message()
+        # A camera that is not calibrated has a size too.
+        sizes.add((int(info.width), int(info.height)))
+        try:
+            cameras.add(msg_adapters.read_camera_info(info))
+        except msg_adapters.MessageError as error:
+            refused[record.topic] = str(error)
+    count = max(len(cameras), len(sizes))
+    if count > 1:
+        raise DataError(f"'{path}' has CameraInfo of {count} cameras: keep that of the keypoints only")
+    return cameras.pop() if cameras else None, sizes.pop() if sizes else None, refused
 
 
 def _told(refused: dict[str, str]) -> str:
