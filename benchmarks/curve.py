@@ -103,7 +103,7 @@ def draw(curves: dict[str, list[dict]], path: Path) -> None:
                 at = [row[part][f"observed_flip_{flip}"] for row in rows]
                 label = STARTS[kind] + (", one flip for all" if flip == "global" else "")
                 ax.plot(minutes, at, style, color=colour, label=label)
-        ax.set(xlabel="minutes, with the search for the start", ylim=(0, 30))
+        ax.set(xlabel="minutes, with the search for the start", ylim=(0, None))
         ax.grid(axis="y", color="#ececec")
         titled(ax, {"train": "training frames", "unseen": "unseen frames"}[part])
     figure.axes[0].set_ylabel("normalised error, %")
