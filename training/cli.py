@@ -100,7 +100,9 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         help="layout of the points: a shipped name, points41 for 41 points without names, or a YAML file "
         "(default: coco17 for 17 points and for bags, else points without names)",
     )
-    parser.add_argument("--topic", help="topic of a bag, where it has several with 2D keypoints")
+    parser.add_argument(
+        "--topic", help="topic of a bag, where it has several with 2D keypoints; * matches any part of a name"
+    )
     parser.add_argument(
         "--min-confidence",
         type=float,

@@ -299,10 +299,7 @@ class Trainer:
         """One optimisation step."""
         phase = self._phase()
         if self._lesson_is_over(phase):
-            self._teacher = {name: weights.clone() for name, weights in self.networks.state_dict().items()}
-            self._lesson = self._held(phase)
-            if phase == REGRESSION:
-                self._forget()
+            self._renew(phase)
         factor = self._rate_factor()
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * factor
@@ -340,6 +337,13 @@ class Trainer:
         if phase == REGRESSION:
             return self.step > 0 and self._own_step == 0
         return phase == HELD and (self._own_step - self._lesson_steps) % self.recipe.hold == 0
+
+    def _renew(self, phase: str) -> None:
+        """The networks' own solutions become the lesson; where a generation begins, fresh networks learn it."""
+        self._teacher = {name: weights.clone() for name, weights in self.networks.state_dict().items()}
+        self._lesson = self._held(phase)
+        if phase == REGRESSION:
+            self._forget()
 
     @torch.no_grad()
     def _held(self, phase: str) -> Lesson:
