@@ -415,7 +415,8 @@ class Trainer:
 
         Every view is seen anew, turned, mirrored and with more points hidden. None of that changes the canonical shape,
         but for a mirrored object, whose shape is mirrored as well.  Where the lower level is held, shapes are seen by
-        other frames' cameras, not their own: a frame whose depth is wrong then does not go on to teach it to itself.
+        other frames' cameras, not their own, with the points that these saw: a frame whose depth is wrong then does not go
+        on to teach it to itself, and one shape gets one code whatever is hidden.
         """
         recipe = self.recipe
         pool = len(self.data.W) if phase == UNSUPERVISED else len(self._lesson.rows)
@@ -432,6 +433,7 @@ class Trainer:
         if recipe.hold:
             others = torch.randint(pool, (size,), generator=self.generator)
             W = self.data.image_unit * self._lesson.seen_by(others, goal)
+            visible = self._visible.index_select(0, self._lesson.rows[others].to(self.device))
         if recipe.hide:
             fewer = visible & (self._uniform(size, visible.shape[1]) >= recipe.hide * self._uniform(size, 1))
             visible = torch.where(enough_visible(fewer, self.data.layout)[:, None], fewer, visible)
