@@ -415,8 +415,8 @@ class Trainer:
 
         Every view is seen anew, turned, mirrored and with more points hidden. None of that changes the canonical shape,
         but for a mirrored object, whose shape is mirrored as well.  Where the lower level is held, shapes are seen by
-        other frames' cameras, not their own, with the points that these saw: a frame whose depth is wrong then does not go
-        on to teach it to itself, and one shape gets one code whatever is hidden.
+        other frames' cameras, not their own, with the points that these saw: a frame whose depth is wrong then does not
+        go on to teach it to itself, and one shape gets one code whatever is hidden.
         """
         recipe = self.recipe
         pool = len(self.data.W) if phase == UNSUPERVISED else len(self._lesson.rows)
