@@ -55,7 +55,8 @@ class Recipe:
     regression_steps: int = 0  # that they learn them for
     steps: int = 20_000  # of the objective; 0: the shapes of the start are the result
     hold: int = 0  # steps that the lower level's solutions of all frames are held for, while the networks learn them as
-    # the cameras of other frames see them (beyond the paper); 0: solved anew for every batch, as the paper does
+    # the cameras of other frames see them (beyond the paper; without perspective, though the data have it); 0: solved
+    # anew for every batch, as the paper does
     generations: int = 1  # of networks; each but the first starts from what the last one made of the frames, less the
     # tenth that it explained worst: most frames that show the wrong mirror image are among those
     batch: int = 256  # 0: all frames at every step
@@ -67,9 +68,7 @@ class Recipe:
     restarts: int = 1  # runs from this seed on; the one with the lowest final loss is kept
     code_weight: float = 4.1231e-3  # the paper: 0.01
     decay_weight: float = 0.0  # of |theta_d|^2; the paper: 1e-4
-    nuclear_weight: float = (
-        0.0  # of the nuclear norm of a batch's shapes, over their number; the paper's ADL + low rank: 0.01
-    )
+    nuclear_weight: float = 0.0  # of the nuclear norm of a batch's N shapes, over N; the paper's ADL + low rank: 0.01
     handedness_weight: float = 1.0  # beyond the paper: keeps frames from settling on mirrored shapes
     bone_weight: float = 1.0  # beyond the paper: edges of the layout keep their lengths
     upright: bool = False  # h sees every view turned and mirrored to one side: for cameras that roll freely, where it
