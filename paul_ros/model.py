@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from paul_ros.files import write_atomically
-from paul_ros.skeleton import Layout, LayoutError
+from paul_ros.skeleton import Layout, LayoutError, Part
 
 FORMAT_VERSION = 1
 DEFAULT_MODEL = "human_coco17"
@@ -73,7 +73,7 @@ class Model:
     @property
     def min_visible(self) -> int:
         """Fewer visible points than this are not lifted: the shape would be mostly guessed."""
-        return min(min_visible(len(part.points)) for part in self.layout.parts)
+        return min(min_visible(self.layout, part) for part in self.layout.parts)
 
     def normalise(self, W: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """Image points (N,2,P) as the encoder takes them: centred, in units of the frame's size or of the data's."""
@@ -139,9 +139,10 @@ class RigidModel(Model):
         return np.broadcast_to(self.mean_shape, (len(W), *self.mean_shape.shape))
 
 
-def min_visible(points: int) -> int:
-    """Fewest visible points out of P that are lifted: 30 % of them, at least 4."""
-    return min(points, max(4, math.ceil(0.3 * points)))
+def min_visible(layout: Layout, part: Part) -> int:
+    """Fewest visible points of a part of the layout that are lifted: what the layout says, else 30 %, at least 4."""
+    points = len(part.points)
+    return min(points, layout.min_visible or max(4, math.ceil(0.3 * points)))
 
 
 def enough_visible(visible: np.ndarray, layout: Layout) -> np.ndarray:
@@ -149,7 +150,7 @@ def enough_visible(visible: np.ndarray, layout: Layout) -> np.ndarray:
 
     Arrays and tensors alike.
     """
-    enough = [visible[:, list(part.points)].sum(1) >= min_visible(len(part.points)) for part in layout.parts]
+    enough = [visible[:, list(part.points)].sum(1) >= min_visible(layout, part) for part in layout.parts]
     return functools.reduce(operator.or_, enough)
 
 

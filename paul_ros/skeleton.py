@@ -23,7 +23,18 @@ MIN_MAPPED = 3
 _SHIPPED = resources.files("paul_ros") / "layouts"
 _MAX_BYTES = 1_000_000
 _MAX_POINTS = 20_000
-_KEYS = ("name", "description", "names", "edges", "left_right", "root", "derived", "handedness", "categories")
+_KEYS = (
+    "name",
+    "description",
+    "names",
+    "edges",
+    "left_right",
+    "root",
+    "derived",
+    "handedness",
+    "categories",
+    "min_visible",
+)
 
 
 class LayoutError(ValueError):
@@ -63,6 +74,7 @@ class Layout:
     handedness: rules of anatomy; may be empty. description: what it is and where its order comes from.
     categories: kinds of objects whose points lie side by side: name -> its points, of which alone a frame of that kind
     has any; empty where all points are of one object.
+    min_visible: fewest points that a frame of one object must show to be lifted; None: a share of them all (model.py).
     """
 
     name: str
@@ -74,6 +86,7 @@ class Layout:
     handedness: tuple[Handedness, ...]
     description: str = ""
     categories: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    min_visible: int | None = None
 
     @classmethod
     def from_dict(cls, data: object) -> Layout:
@@ -99,6 +112,8 @@ class Layout:
         }
         if self.categories:
             layout["categories"] = {name: self._named(points) for name, points in self.categories.items()}
+        if self.min_visible:
+            layout["min_visible"] = self.min_visible
         return layout
 
     @cached_property
@@ -295,6 +310,7 @@ def _parse(data: object) -> Layout:
         handedness=tuple(_rule(rule, index) for rule in _list(data.get("handedness", []), "handedness")),
         description=_text(data["description"], "description").strip() if data.get("description") else "",
         categories=_categories(data.get("categories", {}), index),
+        min_visible=_min_visible(data["min_visible"], names) if "min_visible" in data else None,
     )
 
 
@@ -331,6 +347,12 @@ def _categories(value: object, index: dict[str, int]) -> dict[str, tuple[int, ..
     if categories and sorted(point for points in categories.values() for point in points) != list(range(len(index))):
         raise LayoutError("categories must have every point once")
     return categories
+
+
+def _min_visible(value: object, names: tuple[str, ...]) -> int:
+    if type(value) is not int or not MIN_MAPPED <= value <= len(names):
+        raise LayoutError(f"min_visible must be a whole number from {MIN_MAPPED} to the {len(names)} points")
+    return value
 
 
 def _rule(value: object, index: dict[str, int]) -> Handedness:

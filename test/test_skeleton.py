@@ -13,7 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paul_ros.skeleton import Layout, LayoutError, anonymous_layout, layout_names, load_layout
+from paul_ros.skeleton import Handedness, Layout, LayoutError, anonymous_layout, layout_names, load_layout
 
 POINTS = {
     "body25": 25,
@@ -21,6 +21,7 @@ POINTS = {
     "coco17": 17,
     "h36m17": 17,
     "hri18": 18,
+    "human": 43,
     "mediapipe33": 33,
     "openpose18": 18,
 }
@@ -106,16 +107,16 @@ def test_sides_are_complete_and_symmetric(name: str) -> None:
 @pytest.mark.parametrize("name", POINTS)
 def test_handedness_tells_a_person_from_the_mirror_image(name: str) -> None:
     layout = load_layout(name)
-    (rule,) = layout.handedness
 
-    def volume(sign: int) -> float:
+    def volume(rule: Handedness, sign: int) -> float:
         def mean(points: tuple[int, ...]) -> np.ndarray:
             return np.mean([standing(layout.names[point]) for point in points], axis=0) * (1, sign, 1)
 
         across = np.cross(mean(rule.left) - mean(rule.right), mean(rule.above) - mean(rule.below))
         return across @ (mean(rule.front) - mean(rule.behind))
 
-    assert volume(1) > 0 > volume(-1)
+    assert layout.handedness
+    assert all(volume(rule, 1) > 0 > volume(rule, -1) for rule in layout.handedness)
 
 
 @pytest.mark.parametrize("name", POINTS)
@@ -135,6 +136,25 @@ def test_point_orders_that_are_easily_confused() -> None:
     assert load_layout("body25").names[8::11] == ("pelvis", "left_big_toe")
     assert load_layout("h36m17").names[1::10] == ("right_hip", "left_shoulder")
     assert load_layout("mediapipe33").names[11] == "left_shoulder"
+
+
+BODIES = ("body25", "coco17", "h36m17", "hri18", "mediapipe33", "openpose18")
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_every_body_layout_maps_onto_human_whole_and_back(name: str) -> None:
+    human, layout = load_layout("human"), load_layout(name)
+    assert set(layout.names) <= set(human.names)
+    assert all(human.map_to(layout).sources)
+    xy, confidence, visible = arrays(layout)
+    back = human.map_to(layout)(*layout.map_to(human)(xy, confidence, visible))
+    for out, given_array in zip(back, (xy, confidence, visible)):
+        np.testing.assert_array_equal(out, given_array)
+
+
+def test_human_holds_nothing_that_no_body_layout_has() -> None:
+    assert set(load_layout("human").names) == {point for name in BODIES for point in load_layout(name).names}
+    assert load_layout("human").min_visible == 6
 
 
 def test_mapping_onto_itself_changes_nothing() -> None:
@@ -253,6 +273,8 @@ def test_an_unknown_name_is_answered_with_the_known_ones(name: str, advice: str)
         ({"handedness": [{"left": ["handle"]}]}, "all of them"),
         ({"handedness": [7]}, "must be a mapping, not int"),
         ({"edge": []}, "unknown key 'edge'"),
+        ({"min_visible": 2}, "min_visible must be a whole number from 3 to the 4 points"),
+        ({"min_visible": True}, "min_visible must be a whole number"),
         ({"names": [f"p{i}" for i in range(20_001)]}, "20001 points"),
     ],
 )

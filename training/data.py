@@ -293,8 +293,9 @@ def _checked(
         W = np.where(visible[:, None], W.astype(np.float32, copy=False), np.float32(0))
     enough = enough_visible(visible, layout) & ~_on_one_line(W, visible)
     if not enough.any():
+        least = min(min_visible(layout, part) for part in layout.parts)
         raise DataError(
-            f"none of the {len(W)} frames in '{path}' has {min_visible(len(layout.names))} visible points "
+            f"none of the {len(W)} frames in '{path}' has {least} visible points "
             f"that are not all on one line: nothing to train on"
         )
     if not enough.all():
