@@ -24,6 +24,16 @@ SUPPORTED = {
     "ros_openpose/msg/Frame": openpose.read_frame,
 }
 
+#: Type name -> layout(msg), the name of the layout whose points the message names, None where it does not say.
+_NAMED = {
+    "yolo_msgs/msg/DetectionArray": lambda _: "coco17",
+    "hri_msgs/msg/Skeleton2D": lambda _: "hri18",
+    "zed_msgs/msg/ObjectsStamped": zed.layout,
+    "opendr_interface/msg/OpenDRPose2D": lambda _: "openpose18",
+    "openpose_ros2_msgs/msg/PoseKeyPointsList": openpose.layout_of_list,
+    "ros_openpose/msg/Frame": openpose.layout_of_frame,
+}
+
 #: Types whose message is one person: those of one stamp are of one image.
 ONE_PERSON = frozenset({"hri_msgs/msg/Skeleton2D", "opendr_interface/msg/OpenDRPose2D"})
 
@@ -42,6 +52,14 @@ def read(type_name: str, msg, points: int, source: Source = Source()) -> Keypoin
     return reader(msg, points, source)
 
 
+def named_layout(type_name: str, msg) -> str | None:
+    """The shipped layout whose points the messages of a family are, by what this one says; None = it does not say.
+
+    yolo_ros numbers points only, but those of its pose models are COCO's.
+    """
+    return _NAMED[type_name](msg) if type_name in _NAMED else None
+
+
 __all__ = [
     "ONE_PERSON",
     "SUPPORTED",
@@ -51,6 +69,7 @@ __all__ = [
     "Source",
     "WrongPointCount",
     "join",
+    "named_layout",
     "read",
     "read_camera_info",
 ]

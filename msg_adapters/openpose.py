@@ -52,6 +52,20 @@ def read_frame(msg, points: int, source: Source) -> Keypoints2D:
     return _read(persons, points, source, msg.header)
 
 
+def layout_of_list(msg) -> str | None:
+    """openpose18 or body25, by the number of points of the first person that has any; None = neither."""
+    return _named([len(person.pose_key_points) for person in msg.pose_key_points_list])
+
+
+def layout_of_frame(msg) -> str | None:
+    """The same of the other form."""
+    return _named([len(_body_parts(person)) for person in msg.persons])
+
+
+def _named(counts: list[int]) -> str | None:
+    return {len(OPENPOSE18): "openpose18", len(BODY25): "body25"}.get(next(filter(None, counts), 0))
+
+
 def _body_parts(person) -> list:
     """The package is of ROS 1; ROS 2 forbids capitals in a field's name, so whoever ports it renames the field."""
     return person.bodyParts if hasattr(person, "bodyParts") else person.body_parts

@@ -53,6 +53,12 @@ def read(msg, points: int, source: Source) -> Keypoints2D:
     return record(xy, None, ids, msg.header, present)
 
 
+def layout(msg) -> str | None:
+    """openpose18 of the body format with those points; the larger ones are no shipped layout's."""
+    formats = {int(thing.body_format) for thing in msg.objects if thing.skeleton_available}
+    return "openpose18" if formats == {0} else None
+
+
 def _placed(body, names: tuple[str, ...]) -> np.ndarray:
     """One body's pixels as (P, 2) of the layout."""
     order = _ORDERS.get(int(body.body_format))

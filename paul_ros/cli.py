@@ -56,7 +56,12 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
         "--plot", metavar="FILE.png", type=Path, help="draw frames over their truth, and errors over time"
     )
     parser.add_argument("--model", help="name of a shipped model, or a .npz (default: the shipped human model)")
-    parser.add_argument("--layout", help="layout of the bag's keypoints: a name or a .yaml (default: the model's)")
+    parser.add_argument("--layout", help="layout of the bag's keypoints: a name or a .yaml (default: found from them)")
+    parser.add_argument(
+        "--output-layout",
+        metavar="LAYOUT",
+        help="layout of what is written and judged: a name, a .yaml, or model (default: as of the node's parameter)",
+    )
     parser.add_argument(
         "--topic",
         default="/keypoints",
@@ -79,13 +84,15 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
 
 def _replay(args: argparse.Namespace) -> None:
     from paul_ros.bag import BagError, check_outputs
-    from paul_ros.replay import Topics, evaluate, open_stream, replay
+    from paul_ros.replay import Topics, evaluate, replay
     from paul_ros.report import table, write_json, write_picture
+    from paul_ros.stream import open_stream
 
-    check_outputs([args.output, args.json, args.plot], [args.bag, args.model, args.layout])
+    check_outputs([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic)
     with Ticker("replay") as tick:
-        done = replay(args.bag, open_stream(args.model, args.layout), args.output, topics, tick)
+        stream = open_stream(args.model, args.layout, output_layout=args.output_layout)
+        done = replay(args.bag, stream, args.output, topics, tick)
     report = evaluate(done)
     if args.json:
         write_json(args.json, report)

@@ -21,9 +21,10 @@ import numpy as np
 from msg_adapters.keypoints import stamp_ns
 from paul_ros.bag import LATCHED_QOS, BagError, BagWriter, Record, read_messages, read_records
 from paul_ros.processes import need_ros, process, ros_environment, rss_mb, tail
-from paul_ros.replay import CAMERA_INFO, NODE, POSE_ARRAY, LiftedFrame, Replay, evaluate, open_stream
+from paul_ros.replay import CAMERA_INFO, NODE, POSE_ARRAY, LiftedFrame, Replay, evaluate
 from paul_ros.replay import replay as replay_bag
 from paul_ros.report import table, write_json, write_picture
+from paul_ros.stream import open_stream
 
 BAGS = ("one_person", "two_persons_crossing")
 LAYOUT = "coco17"

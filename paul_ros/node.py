@@ -40,11 +40,10 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import String
 
 import msg_adapters
-from paul_ros.lifter import Lifter
-from paul_ros.model import ModelError, load_model
-from paul_ros.parameters import PARAMETERS, Parameter, as_markdown
-from paul_ros.skeleton import LayoutError, load_layout
-from paul_ros.stream import OUTPUTS, Frame, LiftStream
+from paul_ros.model import ModelError
+from paul_ros.parameters import LIVE, PARAMETERS, Parameter, as_markdown
+from paul_ros.skeleton import LayoutError
+from paul_ros.stream import OUTPUTS, Frame, LiftStream, open_stream
 
 #: Matches every publisher; a few frames deep, so that a hiccup of the scheduler loses none.
 _INPUT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -96,6 +95,7 @@ class LifterNode(Node):
         self._last_number = 0
         values = self._declare_parameters()
         self.stream = self._open_stream(values)
+        self._told = self.stream.route
         self.add_post_set_parameters_callback(self._take_parameters)
         self._outputs = {
             name: self.create_publisher(message_class(type_name), f"~/{name}", _OUTPUT_QOS)
@@ -136,13 +136,11 @@ class LifterNode(Node):
             raise ValueError(
                 f"input_type is {self._wanted_type}; it must be auto or one of {', '.join(msg_adapters.SUPPORTED)}"
             )
-        model = load_model(values["model"])
-        layout = load_layout(values["layout"]) if values["layout"] else model.layout
-        return LiftStream(Lifter(model), layout, values["min_confidence"], values["max_persons"])
+        return open_stream(**values)
 
     def _take_parameters(self, parameters) -> None:
         for parameter in parameters:
-            if parameter.name in ("min_confidence", "max_persons"):
+            if parameter.name in LIVE:
                 setattr(self.stream, parameter.name, parameter.value)
 
     # --- topics
@@ -208,6 +206,8 @@ class LifterNode(Node):
 
     def _take(self, frame: Frame | None) -> None:
         if frame is not None:
+            if self.stream.route is not self._told:
+                self._tell_layouts()
             with self.stream.guard():
                 self._publish(frame)
         self._report_drops()
@@ -233,12 +233,21 @@ class LifterNode(Node):
         for publisher, message in built:
             publisher.publish(message)
 
+    def _tell_layouts(self) -> None:
+        """Once, when the first message has shown which layout the detector uses, and before its frame goes out."""
+        self._told = self.stream.route
+        self.get_logger().info(
+            f"{self._topic} is taken to have the points of {self._told.given.name}, set the parameter `layout` if it "
+            f"has others; published are those of {self._told.output.name}"
+        )
+        self._publish_layout()
+
     def _publish_layout(self) -> None:
         """Says what the outputs mean, again whenever that changes."""
         described = self.stream.describe()
         if described == self._described:
             return
-        if self._described:
+        if self._described.get("units", described["units"]) != described["units"]:
             self.get_logger().info(f"units are now {described['units']}: {described['scale_source']}")
         self._described = described
         self._layout.publish(String(data=json.dumps(described)))

@@ -22,7 +22,18 @@ class Parameter:
 
 PARAMETERS = (
     Parameter("model", "human_coco17", "Model file: the name of one that is shipped, or a path to a .npz."),
-    Parameter("layout", "", "Keypoint layout of the input: a name, or a path to a .yaml; empty = the model's own."),
+    Parameter(
+        "layout",
+        "",
+        "Keypoint layout of the input: a name, or a path to a .yaml; empty = found from the first message that shows "
+        "somebody.",
+    ),
+    Parameter(
+        "output_layout",
+        "",
+        "Keypoint layout of the output: a name, or a path to a .yaml, of whose points the model has all; model = all "
+        "points of the model; empty = the input's, or the model's where that lacks a point of the input's.",
+    ),
     Parameter(
         "input_type",
         "auto",
@@ -35,6 +46,8 @@ PARAMETERS = (
     ),
 )
 
+#: Names of those that may change while the node runs.
+LIVE = tuple(parameter.name for parameter in PARAMETERS if parameter.live)
 #: Name -> default.
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 

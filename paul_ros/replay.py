@@ -32,9 +32,7 @@ from paul_ros.bag import (
     topics_of,
 )
 from paul_ros.lifter import AMBIGUOUS, Lifted, Lifter
-from paul_ros.model import load_model
-from paul_ros.parameters import PARAMETERS
-from paul_ros.skeleton import Mapping, load_layout
+from paul_ros.skeleton import Layout
 from paul_ros.stream import Frame, LiftStream
 
 NODE = "/lifter"
@@ -80,11 +78,15 @@ class Topics:
 
 @dataclass(frozen=True)
 class LiftedFrame:
-    """One message: its N persons in the model's layout in 2D and lifted, and what the camera was then."""
+    """One message: its N persons in the output's layout in 2D and lifted, and what the camera was then.
+
+    given: the keypoints in the model's layout, as they were lifted.
+    """
 
     stamp: int  # ns
     keypoints: Keypoints2D
     lifted: Lifted
+    given: Keypoints2D
     camera: Intrinsics | None
 
 
@@ -92,9 +94,9 @@ class LiftedFrame:
 class Replay:
     """A replayed bag.
 
-    frames: in the bag's order. truth: stamp -> (N,P,3) metres, camera frame, in the model's layout; row i is the person
-    of row i of the keypoints of that stamp; points that the truth lacks are NaN. damage: what was wrong with the bag;
-    then only what lies before it is here.
+    frames: in the bag's order. truth: stamp -> (N,P,3) metres, camera frame, in the output's layout; row i is the
+    person of row i of the keypoints of that stamp; points that the truth lacks are NaN. damage: what was wrong with the
+    bag; then only what lies before it is here.
     """
 
     bag: Path
@@ -103,20 +105,10 @@ class Replay:
     truth: dict[int, np.ndarray] = field(default_factory=dict)
     damage: BagError | None = None
 
-
-def open_stream(model: str | None = None, layout: str | None = None) -> LiftStream:
-    """The stream that the node makes of the same parameters; None = the node's default.
-
-    Raises ModelError, LayoutError.
-    """
-    default = {parameter.name: parameter.default for parameter in PARAMETERS}
-    loaded = load_model(model or default["model"])
-    return LiftStream(
-        Lifter(loaded),
-        load_layout(layout) if layout else loaded.layout,
-        default["min_confidence"],
-        default["max_persons"],
-    )
+    @property
+    def layout(self) -> Layout:
+        """Of frames and truth."""
+        return self.stream.route.output
 
 
 def replay(
@@ -158,6 +150,7 @@ class _Shell:
         self.keypoint_messages = 0
         self._make = BagMessages()
         self._described: dict = {}
+        self._truth: dict[int, np.ndarray] = {}
         self._last_time = 0
 
     def take(self, record: Record) -> bool:
@@ -182,28 +175,34 @@ class _Shell:
         self._take_frame(frame)
 
     def finish(self) -> None:
-        """Takes what the stream has kept for more persons of the last image."""
+        """Takes what the stream has kept for more persons of the last image, and the truth: its layout is known now."""
         self._take_frame(self.done.stream.flush())
+        for stamp, flat in self._truth.items():
+            self._map_truth(stamp, flat)
 
     def _take_frame(self, frame: Frame | None) -> None:
         if frame is None:
             return
         camera = self.done.stream.intrinsics
-        self.done.frames.append(LiftedFrame(frame.keypoints.stamp, frame.keypoints, frame.lifted, camera))
+        stamp = frame.keypoints.stamp
+        self.done.frames.append(LiftedFrame(stamp, frame.keypoints, frame.lifted, frame.given, camera))
         if self.writer:
             for name, message in frame.messages(self._make).items():
                 self.writer.write(f"{NODE}/{name}", message, self._last_time)
 
     def _take_truth(self, message: object) -> None:
-        stream = self.done.stream
         flat = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses], float).reshape(-1, 3)
         flat[~(np.abs(flat) < _FARTHEST).all(axis=1)] = np.nan
-        points = len(stream.layout.names)
+        self._truth[stamp_ns(message.header)] = flat
+
+    def _map_truth(self, stamp: int, flat: np.ndarray) -> None:
+        """It comes in the input's layout."""
+        route = self.done.stream.route
+        points = len(route.given.names)
         if len(flat) % points:
-            stream.drops["truth_wrong_point_count"] += 1
+            self.done.stream.drops["truth_wrong_point_count"] += 1
             return
-        mapping = stream.layout.map_to(stream.lifter.model.layout)
-        self.done.truth[stamp_ns(message.header)] = map_points(mapping, flat.reshape(-1, points, 3))
+        self.done.truth[stamp] = route.points_out(flat.reshape(-1, points, 3))
 
     def _write_layout(self, log_time: int) -> None:
         described = self.done.stream.describe()
@@ -211,15 +210,6 @@ class _Shell:
             self._described = described
             message = self._make("std_msgs/msg/String", data=json.dumps(described))
             self.writer.write(f"{NODE}/layout", message, log_time, LATCHED_QOS)
-
-
-def map_points(mapping: Mapping, points: np.ndarray) -> np.ndarray:
-    """3D points (N,P,3) of a mapping's source layout in its target's points; NaN for those that the source lacks."""
-    mapped = np.full((len(points), len(mapping.sources), 3), np.nan)
-    for index, parts in enumerate(mapping.sources):
-        if parts:
-            mapped[:, index] = points[:, list(parts)].mean(axis=1)
-    return mapped
 
 
 def _decoded(record: Record, role: str, *readable: str) -> object:
@@ -261,16 +251,17 @@ def evaluate(done: Replay) -> dict:
         "lifted": stream.counts["lifted"],
         "dropped": dict(sorted(stream.drops.items())),
         "units": stream.units,
-        **errors(with_truth(done, done.frames), model.layout.root),
+        **errors(with_truth(done, done.frames), done.layout.root),
         "reprojection_median_px": _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),
         "certified_share": _mean([lift.certified[good] for lift, good in zip(lifts, ok)]),
         "ambiguous_share": _mean([lift.ambiguity[good] >= AMBIGUOUS for lift, good in zip(lifts, ok)]),
         "lift_us_median": _number(np.median(times)),
         "lift_us_p99": _number(np.percentile(times, 99)),
-        "baseline": errors(with_truth(done, rigid_frames(done)), model.layout.root),
+        "baseline": errors(with_truth(done, rigid_frames(done)), done.layout.root),
         "model": model.name,
         "model_sha256": model.sha256,
-        "layout": model.layout.name,
+        "layout": done.layout.name,
+        "input_layout": stream.route.given.name,
         "damage": str(done.damage) if done.damage else None,
         "versions": versions(),
     }
@@ -280,7 +271,9 @@ def rigid_frames(done: Replay) -> list[LiftedFrame]:
     """The same frames lifted with the model's mean shape, the baseline."""
     rigid = Lifter(done.stream.lifter.model.rigid())
     return [
-        replace(frame, lifted=rigid.lift(frame.keypoints.xy, frame.keypoints.visible, frame.camera))
+        replace(
+            frame, lifted=done.stream.route.lifted_out(rigid.lift(frame.given.xy, frame.given.visible, frame.camera))
+        )
         for frame in done.frames
     ]
 

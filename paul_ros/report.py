@@ -185,7 +185,7 @@ def _at_true_root(done: Replay, frame: LiftedFrame) -> tuple[np.ndarray, np.ndar
     points, truth = frame.lifted.points[frame.lifted.ok], done.truth.get(frame.stamp)
     if truth is None or len(truth) != len(frame.lifted.ok):
         return points, np.empty((0, *points.shape[1:]))
-    truth, root = truth[frame.lifted.ok], list(done.stream.lifter.model.layout.root)
+    truth, root = truth[frame.lifted.ok], list(done.layout.root)
     present = np.isfinite(truth).all(axis=2)
     for person in np.flatnonzero(present.sum(axis=1) >= LEAST_POINTS):
         anchor = root if present[person, root].all() else present[person]
@@ -199,7 +199,7 @@ def _at_true_root(done: Replay, frame: LiftedFrame) -> tuple[np.ndarray, np.ndar
 
 def _draw_bones(ax: Any, done: Replay, points: np.ndarray, truth: bool = False) -> None:
     """One skeleton in 2D (P,2); bones with a NaN end do not show."""
-    layout = done.stream.lifter.model.layout
+    layout = done.layout
     for a, b in layout.edges:
         side = layout.sides[a] if layout.sides[a] == layout.sides[b] else ""
         style = (

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one path from a 2D keypoint message to 3D messages; node and replay are thin shells over it.
 
-message -> adapter -> confidence threshold -> model's layout -> Lifter -> messages. Nothing a message holds
-may stop the stream: what cannot be used is dropped, counted by its reason and explained.
+message -> adapter -> confidence threshold -> model's layout -> Lifter -> output layout -> messages. Nothing a message
+holds may stop the stream: what cannot be used is dropped, counted by its reason and explained.
 """
 
 from __future__ import annotations
@@ -12,13 +12,16 @@ import functools
 import logging
 import time
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, outputs
 from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
+from paul_ros.model import load_model
+from paul_ros.parameters import DEFAULTS
+from paul_ros.route import MODEL, Route, read_unknown
 from paul_ros.skeleton import Layout, layout_names, load_layout
 
 #: Lift times kept for the median and the 99th percentile: the last half minute at 30 Hz.
@@ -39,14 +42,16 @@ _log = logging.getLogger(__name__)
 class Frame:
     """One lifted message.
 
-    header: the input's own header; keypoints: its N persons in the model's layout, low confidences hidden;
-    lifted: their 3D; layout: the model's; bone_width in the units of the points.
+    header: the input's own header; keypoints: its N persons, low confidences hidden; lifted: their 3D, both in the
+    layout of the output; given: the keypoints in the model's layout, as they were lifted; bone_width in the units of
+    the points.
     """
 
     header: object
     keypoints: Keypoints2D
     lifted: Lifted
     layout: Layout
+    given: Keypoints2D
     bone_width: float
 
     def message(self, output: str, make):
@@ -85,6 +90,24 @@ OUTPUTS = {
 }
 
 
+def open_stream(model: str | None = None, layout: str | None = None, **parameters) -> LiftStream:
+    """The stream of the node's parameters; one that is left out, or None, has its default.
+
+    Raises ModelError, LayoutError.
+    """
+    given = {"model": model, "layout": layout, **parameters}
+    values = {**DEFAULTS, **{name: value for name, value in given.items() if value is not None}}
+    loaded = load_model(values["model"])
+    output = values["output_layout"]
+    return LiftStream(
+        Lifter(loaded),
+        load_layout(values["layout"]) if values["layout"] else None,
+        values["min_confidence"],
+        values["max_persons"],
+        loaded.layout if output == MODEL else load_layout(output) if output else None,
+    )
+
+
 class LiftStream:
     """Lifts a stream of 2D keypoint messages, one image at a time and each for itself.
 
@@ -96,10 +119,19 @@ class LiftStream:
     lift_us: the last lift times in microseconds, of frames with persons.
     """
 
-    def __init__(self, lifter: Lifter, layout: Layout, min_confidence: float, max_persons: int) -> None:
-        """layout: of the messages; raises LayoutError where the model's layout cannot be had from it."""
+    def __init__(
+        self,
+        lifter: Lifter,
+        layout: Layout | None,
+        min_confidence: float,
+        max_persons: int,
+        output_layout: Layout | None = None,
+    ) -> None:
+        """layout: of the messages, None = found from the first that shows somebody; output_layout: see Route.between.
+
+        Raises LayoutError where these cannot be had from each other.
+        """
         self.lifter = lifter
-        self.layout = layout
         self.min_confidence = min_confidence
         self.max_persons = max_persons
         self.intrinsics: Intrinsics | None = None
@@ -108,10 +140,18 @@ class LiftStream:
         self.notes: Counter = Counter()
         self.explanations: dict[str, str] = {}
         self.lift_us: deque[float] = deque(maxlen=_TIMES_KEPT)
-        self._mapping = layout.map_to(lifter.model.layout)
+        self._known = Route.between(layout, lifter.model.layout, output_layout) if layout else None
+        # Until the input's layout is known there are only empty frames.
+        self._nobody = Route.between(lifter.model.layout, lifter.model.layout, output_layout)
+        self._output_layout = output_layout
         self._last_stamp: int | None = None
         self._image_size: tuple[int, int] | None = None
         self._gathered = _Gathered()
+
+    @property
+    def route(self) -> Route:
+        """The layouts that points go through; as if the input had the model's own until its layout is known."""
+        return self._known or self._nobody
 
     @property
     def units(self) -> str:
@@ -179,13 +219,14 @@ class LiftStream:
 
     def describe(self) -> dict:
         """What the outputs mean, for ~/layout and the head of a report."""
-        model = self.lifter.model
+        model, layout = self.lifter.model, self.route.output
         return {
-            "layout": model.layout.name,
-            "keypoints": list(model.layout.names),
-            "edges": [list(edge) for edge in model.layout.edges],
-            "sides": list(model.layout.sides),
-            "input_layout": self.layout.name,
+            "layout": layout.name,
+            "keypoints": list(layout.names),
+            "edges": [list(edge) for edge in layout.edges],
+            "sides": list(layout.sides),
+            "input_layout": self.route.given.name if self._known else None,
+            "model_layout": model.layout.name,
             "units": self.units,
             "frame": "header.frame_id of the input, an optical frame (REP-103): x right, y down, z forward",
             "scale_source": _scale_source(self.intrinsics, model.metres_per_unit),
@@ -196,10 +237,19 @@ class LiftStream:
         }
 
     def _read(self, type_name: str, msg, topic: str) -> Keypoints2D:
-        names = self.layout.names
-        keypoints = msg_adapters.read(type_name, msg, len(names), Source(names, self._image_size, topic))
-        self._check_persons(keypoints.persons)
-        return self._in_model_layout(keypoints)
+        """In the model's layout."""
+        route = self.route
+        source = Source(route.given.names, self._image_size, topic)
+        if self._known:
+            keypoints = msg_adapters.read(type_name, msg, len(source.names), source)
+            self._check_persons(keypoints.persons)
+        else:
+            keypoints, found = read_unknown(self.lifter.model.layout, type_name, msg, source)
+            self._check_persons(keypoints.persons)
+            route = Route.between(found, self.lifter.model.layout, self._output_layout)
+            if keypoints.visible.any():
+                self._known = route
+        return route.keypoints_in(keypoints, self.min_confidence)
 
     def _check_persons(self, persons: int) -> None:
         if persons > self.max_persons:
@@ -209,24 +259,19 @@ class LiftStream:
                 f"right, raise the parameter `max_persons` above {self.max_persons}",
             )
 
-    def _in_model_layout(self, keypoints: Keypoints2D) -> Keypoints2D:
-        sure = keypoints.visible & (keypoints.confidence >= self.min_confidence)
-        xy, confidence, visible = self._mapping(keypoints.xy, keypoints.confidence, sure)
-        return replace(keypoints, xy=xy, confidence=np.where(visible, confidence, 0.0), visible=visible)
-
-    def _frame(self, header, keypoints: Keypoints2D) -> Frame:
+    def _frame(self, header, given: Keypoints2D) -> Frame:
         # Every frame is lifted for itself, so time may run backwards, as when a bag loops; it is only noted.
-        if self._last_stamp is not None and keypoints.stamp < self._last_stamp:
+        if self._last_stamp is not None and given.stamp < self._last_stamp:
             self.notes["stamp_backwards"] += 1
-        self._last_stamp = keypoints.stamp
-        lifted = self._lift(keypoints)
-        self.counts.update(frames=1, persons=keypoints.persons, lifted=int(lifted.ok.sum()))
+        self._last_stamp = given.stamp
+        lifted = self._lift(given)
+        self.counts.update(frames=1, persons=given.persons, lifted=int(lifted.ok.sum()))
         for reason in filter(None, lifted.reason):
             self._drop("person_" + reason, f"{_LEFT_OUT[reason]}; this person is left out of the outputs")
-        model = self.lifter.model
+        model, route = self.lifter.model, self.route
         unit = model.metres_per_unit if lifted.units == "m" else 1.0
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
-        return Frame(header, keypoints, lifted, model.layout, width)
+        return Frame(header, route.keypoints_out(given), route.lifted_out(lifted), route.output, given, width)
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:
         start = time.perf_counter_ns()

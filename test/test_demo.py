@@ -10,7 +10,8 @@ import pytest
 
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
 from paul_ros.demo import BAGS, DemoError, compare, find_bag, run_live
-from paul_ros.replay import open_stream, replay
+from paul_ros.replay import replay
+from paul_ros.stream import open_stream
 
 
 @pytest.fixture(scope="module")

@@ -221,6 +221,13 @@ def test_without_camera_info_units_are_the_models_and_it_says_so_once(bench):
     assert bench.lifter.log().count("model units") == 1
 
 
+def test_the_layout_that_was_found_is_said_once(bench):
+    for _ in range(2):
+        bench.lifts()
+    assert bench.lifter.log().count("is taken to have the points of coco17") == 1
+    assert [json.loads(msg.data)["input_layout"] for msg in bench.got["layout"]][-1] == "coco17"
+
+
 def test_header_is_the_inputs_in_every_output(bench):
     def fill(header):
         header.stamp.sec, header.stamp.nanosec = 2_000_000_123, 999_999_999
@@ -539,6 +546,8 @@ def test_a_fault_in_building_leaves_no_half_frame(ros, lifter_node):
 #: The packages of messages of one person are on no index, so these are handed to the node; all else is real.
 POSES = [dict(zip(load_layout("coco17").names, xy.tolist())) for xy in seen(persons_at((0.3, 0, 4), (-1, 0, 5)))]
 
+OPENDR_POINTS = len(load_layout("openpose18").names)
+
 
 def one_person(node, build, seconds: int, **person) -> None:
     node._on_keypoints(build(LiveMake(), header_of(MAKE, seconds), **person), {"publication_sequence_number": 0})
@@ -574,10 +583,10 @@ def test_persons_in_a_message_each_are_published_when_no_more_come(lifter_node, 
         one_person(lifter_node, opendr, 1, pose=pose, ident=ident)
     assert lifter_node.stream.counts["frames"] == 0
     (image,) = poses_of_node(bool, "the image without a next one")
-    assert (image.header.stamp.sec, len(image.poses)) == (1, 2 * 17)
+    assert (image.header.stamp.sec, len(image.poses)) == (1, 2 * OPENDR_POINTS)
     one_person(lifter_node, opendr, 2, pose=POSES[0], ident=1)
     _, image = poses_of_node(lambda got: len(got) == 2, "one more image")
-    assert (image.header.stamp.sec, len(image.poses)) == (2, 17)
+    assert (image.header.stamp.sec, len(image.poses)) == (2, OPENDR_POINTS)
     assert lifter_node._silence_timer.is_canceled()
     assert lifter_node.stream.counts == dict(frames=2, persons=3, lifted=3) and not lifter_node.stream.drops
 
@@ -590,7 +599,7 @@ def test_a_node_kept_from_running_between_two_persons_tears_no_image(lifter_node
     lifter_node._on_silence()
     one_person(lifter_node, opendr, 1, pose=POSES[1], ident=2)
     (image,) = poses_of_node(bool, "the image")
-    assert len(image.poses) == 2 * 17 and lifter_node.stream.counts["frames"] == 1
+    assert len(image.poses) == 2 * OPENDR_POINTS and lifter_node.stream.counts["frames"] == 1
 
 
 def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
@@ -603,7 +612,7 @@ def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
     _spin(lifter_node, stop)
     assert "1 frames, 1 of 1 persons lifted" in lifter_node.summary()
     (image,) = poses_of_node(bool, "the image")
-    assert len(image.poses) == 17
+    assert len(image.poses) == OPENDR_POINTS
 
 
 def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):

@@ -12,9 +12,11 @@ import pytest
 
 from paul_ros import metrics
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
-from paul_ros.replay import Topics, evaluate, map_points, open_stream, replay
+from paul_ros.replay import Topics, evaluate, replay
 from paul_ros.report import PictureError, table, write_json, write_picture
+from paul_ros.route import map_points
 from paul_ros.skeleton import load_layout
+from paul_ros.stream import open_stream
 
 ROOT = Path(__file__).resolve().parent.parent
 BAGS = ROOT / "bags"
@@ -78,7 +80,7 @@ def test_lifted_bag_holds_inputs_and_outputs(short, model_file, tmp_path):
         "/camera_info": 90,
         "/keypoints": 90,
         "/ground_truth/poses": 90,
-        "/lifter/layout": 1,
+        "/lifter/layout": 2,
         "/lifter/poses": 90,
         "/lifter/keypoints3d": 90,
         "/lifter/markers": 90,
@@ -88,8 +90,10 @@ def test_lifted_bag_holds_inputs_and_outputs(short, model_file, tmp_path):
     for (_, _, message, _), frame in zip(read_messages(tmp_path / "out.mcap", ["/lifter/poses"]), done.frames):
         published = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses]).reshape(-1, 17, 3)
         assert np.array_equal(published, frame.lifted.points[frame.lifted.ok])
-    [(_, _, layout, _)] = read_messages(tmp_path / "out.mcap", ["/lifter/layout"])
-    assert json.loads(layout.data)["units"] == "m"
+    # The first frames show nobody, so the input's layout is known only later.
+    told = [json.loads(message.data) for _, _, message, _ in read_messages(tmp_path / "out.mcap", ["/lifter/layout"])]
+    assert [layout["input_layout"] for layout in told] == [None, "coco17"]
+    assert all(layout["units"] == "m" and layout["layout"] == "coco17" for layout in told)
     latched = next(r for r in read_records(tmp_path / "out.mcap", ["/lifter/layout"]))
     assert "transient_local" in latched.qos
 

@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import camera_info, header_of, persons_at, seen
+from conftest import PERSON, camera_info, header_of, persons_at, seen
 
 from msg_adapters import outputs
 from paul_ros.lifter import Lifter
 from paul_ros.model import load_model
 from paul_ros.skeleton import Layout, LayoutError, load_layout
-from paul_ros.stream import OUTPUTS, LiftStream
+from paul_ros.stream import OUTPUTS, LiftStream, open_stream
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 GOOD = persons_at((0.3, 0, 4), (-1, 0.1, 5))
@@ -138,7 +138,7 @@ def test_another_layout_is_mapped_by_name(model_file, make):
     straight = LiftStream(Lifter(model), model.layout, 0.3, 64)
     xy = seen(GOOD)
     np.testing.assert_array_equal(
-        stream.keypoints(CLOUD, cloud(make, xy[:, ::-1])).lifted.points,
+        stream.keypoints(CLOUD, cloud(make, xy[:, ::-1])).lifted.points[:, ::-1],
         straight.keypoints(CLOUD, cloud(make, xy)).lifted.points,
     )
 
@@ -228,3 +228,123 @@ def test_the_same_messages_give_the_same_bits(model_file, make):
         return stream.keypoints(CLOUD, cloud(make, seen(GOOD))).lifted.points
 
     np.testing.assert_array_equal(run(), run())
+
+
+# --- layouts
+
+
+def superset_model(model_file, tmp_path):
+    """A model of all points of COCO-17 and BODY_25 and one more; its every shape is the fixture's."""
+    from paul_ros.model import save_model, to_unit_size, weight_shapes
+
+    coco, body = load_layout("coco17"), load_layout("body25")
+    names = [*coco.names, *(name for name in body.names if name not in coco.names), "head_top"]
+    place = {name: point for name, point in zip(coco.names, PERSON)}
+    place |= {"neck": PERSON[5:7].mean(0), "pelvis": PERSON[11:13].mean(0), "head_top": PERSON[0] - (0, 0.2, -0.1)}
+    for side in ("left", "right"):
+        ankle = place[f"{side}_ankle"]
+        place |= {f"{side}_{part}": ankle + (0, 0.05, -0.1) for part in ("heel", "big_toe", "small_toe")}
+    data = {**coco.to_dict(), "name": "both", "names": names, "root": ["pelvis"], "derived": {}}
+    layout = Layout.from_dict(data)
+    model = load_model(model_file)
+    points = np.array([place[name] for name in names])
+    start, end = np.array(layout.edges).T
+    metres = float(np.linalg.norm(points[start] - points[end], axis=1).mean())
+    header = {**model.header, "layout": layout.to_dict(), "metres_per_unit": metres}
+    arrays = {name: np.zeros(size) for name, size in weight_shapes(header, len(names)).items()}
+    arrays["mean_shape"] = to_unit_size(points.T[None], layout)[0]
+    arrays["decoder.1.bias"] = arrays["mean_shape"].ravel()
+    save_model(tmp_path / "both.npz", header, arrays)
+    return load_model(tmp_path / "both.npz"), place
+
+
+@pytest.fixture
+def both(model_file, tmp_path):
+    return superset_model(model_file, tmp_path)
+
+
+def finding(model, **given) -> LiftStream:
+    """A stream that nobody told the input's layout."""
+    return LiftStream(Lifter(model), None, 0.3, 64, **given)
+
+
+@pytest.mark.parametrize("name", ["coco17", "openpose18", "body25"])
+@pytest.mark.parametrize("persons", [1, 3])
+def test_one_model_serves_every_layout_by_the_number_of_its_points(both, make, name, persons):
+    model, place = both
+    points = np.array([place[part] for part in load_layout(name).names])
+    truth = points + np.array([(0.6 * person - 0.5, 0, 5) for person in range(persons)])[:, None]
+    stream = finding(model)
+    stream.camera_info(camera_info(make))
+    for message in (cloud(make, seen(truth)), flat(make, seen(truth))):
+        frame = stream.keypoints(message_type(message), message)
+        assert stream.route.given.name == stream.describe()["layout"] == frame.layout.name == name
+        np.testing.assert_allclose(frame.lifted.points, truth, atol=0.12)
+        assert len(frame.message("poses", make).poses) == persons * len(points)
+        assert frame.message("keypoints3d", make).width == len(points)
+        assert len(frame.message("markers", make).markers[1].points) == persons * len(points)
+
+
+def flat(make, xy: np.ndarray):
+    return outputs.pose_array(make, header_of(make), np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1))
+
+
+def message_type(message) -> str:
+    return "geometry_msgs/msg/PoseArray" if hasattr(message, "poses") else CLOUD
+
+
+def test_the_models_own_layout_goes_before_a_shipped_one_of_as_many_points(model_file, make):
+    """A model of 17 points of another kind of object: they are not taken for a person's."""
+    model = load_model(model_file)
+    door = Layout.from_dict({"name": "door", "names": [f"d{n}" for n in range(17)], "root": ["d0"]})
+    stream = finding(replace(model, layout=door))
+    assert stream.keypoints(CLOUD, cloud(make, seen(GOOD))).layout.name == "door"
+    assert stream.keypoints(CLOUD, cloud(make, np.ones((1, 25, 2)))) is None
+    assert stream.drops == {"wrong_point_count": 1}
+
+
+def test_a_layout_once_found_is_kept(both, make):
+    stream = finding(both[0])
+    assert stream.describe()["input_layout"] is None
+    assert stream.keypoints(CLOUD, cloud(make, np.empty((0, 25, 2)))).lifted.ok.shape == (0,)
+    assert stream.keypoints(CLOUD, cloud(make, np.full((1, 18, 2), np.nan))).lifted.reason == ("too_few_points",)
+    assert stream.describe()["input_layout"] is None
+    assert_lifts(stream, make)
+    assert stream.describe()["input_layout"] == "coco17"
+    assert stream.keypoints(CLOUD, cloud(make, np.ones((1, 25, 2)))) is None
+    assert "body25" in stream.explanations["wrong_point_count"]
+
+
+@pytest.mark.parametrize("output, points", [("model", 26), ("openpose18", 18), ("coco17", 17), (None, 17)])
+def test_what_is_published_may_be_another_layout(both, make, output, points):
+    model, place = both
+    layout = model.layout if output == "model" else load_layout(output) if output else None
+    stream = finding(model, output_layout=layout)
+    stream.camera_info(camera_info(make))
+    hidden = np.ones((2, 17))
+    hidden[:, 9] = 0.1
+    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD), hidden))
+    names = stream.describe()["keypoints"]
+    assert frame.lifted.points.shape == (2, points, 3) and len(names) == points
+    expected = np.array([place[name] for name in names]) + (0.3, 0, 4)
+    np.testing.assert_allclose(frame.lifted.points[0], expected, atol=0.12)
+    seen_names = {name for name, visible in zip(names, frame.keypoints.visible[0]) if visible}
+    assert seen_names == set(load_layout("coco17").names) & set(names) - {"left_wrist"} | {
+        name for name in ("neck", "pelvis") if name in names
+    }
+
+
+def test_points_that_the_model_lacks_are_never_published(stream, model_file, make):
+    """BODY_25 into a model of 17 points: those of the model come out; asked for by name they are refused."""
+    own = LiftStream(stream.lifter, load_layout("body25"), 0.3, 64)
+    assert own.route.output.name == "coco17"
+    with pytest.raises(LayoutError, match="has no left_big_toe.*'model'"):
+        LiftStream(stream.lifter, None, 0.3, 64, output_layout=load_layout("body25"))
+
+
+def test_open_stream_takes_the_nodes_parameters(model_file):
+    stream = open_stream(str(model_file), max_persons=3, output_layout="openpose18")
+    assert (stream.max_persons, stream.min_confidence, stream.route.output.name) == (3, 0.3, "openpose18")
+    assert open_stream(str(model_file), output_layout="model").route.output.name == "coco17"
+    with pytest.raises(LayoutError, match="coco17"):
+        open_stream(str(model_file), output_layout="coco71")

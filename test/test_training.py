@@ -16,7 +16,8 @@ from tiny_data import FROM_RANDOM_WEIGHTS
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records
 from paul_ros.model import ModelError, load_model
-from paul_ros.replay import open_stream, replay
+from paul_ros.replay import replay
+from paul_ros.stream import open_stream
 from paul_ros.skeleton import load_layout
 from training import cli, human_data
 from training.data import DataError, load_training_data
