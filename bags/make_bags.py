@@ -22,7 +22,8 @@ sys.path.insert(0, str(HERE.parent))  # run from a checkout that nobody installe
 
 from msg_adapters.outputs import keypoints_cloud, pose_array  # noqa: E402
 from paul_ros.bag import BagMessages, BagWriter  # noqa: E402
-from training.mocap import coco17_from_cmu31  # noqa: E402
+from paul_ros.skeleton import load_layout  # noqa: E402
+from training.mocap import layout_points  # noqa: E402
 
 RATE = 30  # Hz
 START = 1_750_000_000 * 1_000_000_000  # ns; any time will do
@@ -74,7 +75,7 @@ class Person:
     def points(self) -> np.ndarray:
         """COCO-17 in the world, (F,17,3) metres."""
         with np.load(HERE / "source" / f"{self.clip}.npz", allow_pickle=False) as file:
-            points = coco17_from_cmu31(file["joints"])
+            points = layout_points(file["joints"], load_layout("coco17"))
         sin, cos = math.sin(math.radians(self.yaw_deg)), math.cos(math.radians(self.yaw_deg))
         x, z = points[..., 0] - self.pivot[0], points[..., 2] - self.pivot[1]
         return np.stack(

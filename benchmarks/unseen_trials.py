@@ -19,8 +19,9 @@ from msg_adapters import Intrinsics
 from paul_ros import metrics
 from paul_ros.lifter import Lifter
 from paul_ros.model import DEFAULT_MODEL, load_model
+from paul_ros.skeleton import load_layout
 from training.human_data import HELD_OUT, read_clips
-from training.mocap import coco17_from_cmu31
+from training.mocap import layout_points
 
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)
 HIPS = [11, 12]
@@ -60,7 +61,7 @@ def main() -> None:
     print("| trial | PA-MPJPE mm | N-MPJPE mm | NE % frame flip | NE % global flip | root mm |\n|" + "---|" * 6)
     rows = []
     for name, joints in sorted(clips.items()):
-        views = [seen_from(coco17_from_cmu31(joints[::12]), yaw) for yaw in (0.3, 1.87, 3.44, 5.01)]
+        views = [seen_from(layout_points(joints[::12], load_layout("coco17")), yaw) for yaw in (0.3, 1.87, 3.44, 5.01)]
         rows.append([np.mean([figures(lifter, view) for view in views], axis=0) for lifter in lifters])
         print_row(name, *rows[-1])
     print_row("mean", *np.mean(rows, axis=0))

@@ -13,7 +13,8 @@ import pytest
 import msg_adapters
 from msg_adapters.keypoints import stamp_ns
 from paul_ros.bag import read_messages, topics_of
-from training.mocap import CMU31, coco17_from_cmu31
+from paul_ros.skeleton import load_layout
+from training.mocap import CMU31, layout_points
 
 BAGS = Path(__file__).resolve().parent.parent / "bags"
 NAMES = {"one_person.mcap": 585, "two_persons_crossing.mcap": 390}
@@ -126,7 +127,7 @@ def test_two_persons_cross_hide_and_leave():
 
 def test_coco_points_of_a_plain_pose():
     """A T-pose made by hand: y up, facing +z, so left is +x."""
-    joints = np.zeros((1, len(CMU31), 3))
+    joints = np.random.default_rng(0).standard_normal((1, len(CMU31), 3))
     places = {
         "upperneck": (0, 1.5, 0),
         "head": (0, 1.7, 0),
@@ -137,9 +138,9 @@ def test_coco_points_of_a_plain_pose():
     }
     for name, place in places.items():
         joints[0, CMU31.index(name)] = place
-    points = coco17_from_cmu31(joints)[0]
+    points = layout_points(joints, load_layout("coco17"))[0]
     assert np.allclose(points[0], (0, 1.6, 0.11)) and np.allclose(points[1], (0.032, 1.64, 0.085))
     assert np.allclose(points[4], (-0.075, 1.62, 0))
     assert np.allclose(points[9], (0.8, 1.4, 0)) and np.allclose(points[16], (-0.1, 0.1, 0))
     with pytest.raises(ValueError, match="31"):
-        coco17_from_cmu31(joints[:, :17])
+        layout_points(joints[:, :17], load_layout("coco17"))

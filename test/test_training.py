@@ -17,12 +17,11 @@ from msg_adapters.outputs import keypoints_cloud
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records
 from paul_ros.model import ModelError, load_model
 from paul_ros.replay import replay
-from paul_ros.stream import open_stream
 from paul_ros.skeleton import load_layout
-from training import cli, human_data
+from paul_ros.stream import open_stream
+from training import cli
 from training.data import DataError, load_training_data
 from training.export import mean_shape, metres_per_unit
-from training.mocap import CMU31
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.trainer import Trainer, TrainingError
 
@@ -302,42 +301,6 @@ def test_mean_shape_forgets_orientation():
     turned = Rotation.random(30, random_state=0).as_matrix() @ shape
     lengths = [np.linalg.norm(s[:, :, None] - s[:, None], axis=0) for s in (mean_shape(turned), shape)]
     np.testing.assert_allclose(*lengths, atol=1e-9)
-
-
-# --- human_data: what the trainer of the shipped model is fed
-
-
-def clip(seed, frames=60):
-    """A made-up moving CMU-31 skeleton (F,31,3)."""
-    rng = np.random.default_rng(seed)
-    base, sway = rng.standard_normal((31, 3)), rng.standard_normal((31, 3))
-    return base + 0.3 * np.sin(np.linspace(0, 6, frames))[:, None, None] * sway
-
-
-def test_no_held_out_frame_trains_under_any_name():
-    turned = 2 * clip(1) @ Rotation.random(random_state=0).as_matrix().T + 5
-    clips = [("02_01", clip(1)), ("05_18", clip(2)), ("05_01", clip(3)), ("walking_1", turned), ("walking_2", clip(4))]
-    assert [name for name, _ in human_data.training_clips(clips)] == ["05_01", "walking_2"]
-
-
-def test_views_are_what_a_camera_would_see():
-    rng = np.random.default_rng(0)
-    points = np.tile(rng.standard_normal((17, 3)) * 0.3, (50, 1, 1))
-    W, visible, S = human_data.see(points, human_data.Views(noise=0, outlier_noise=0, swap_share=0), rng)
-    lengths = np.linalg.norm(S[:, :, 0] - S[:, :, 9], axis=1)
-    np.testing.assert_allclose(lengths, np.linalg.norm(points[0, 0] - points[0, 9]), rtol=1e-5)
-    depth = S[:, 2].astype(float)
-    distance = S[:, 0, 5] / W[:, 0, 5] - depth[:, 5]
-    np.testing.assert_allclose(W, S[:, :2] / (depth + distance[:, None])[:, None], rtol=1e-3, atol=1e-5)
-    assert ((distance > 2.4) & (distance < 10.1)).all()
-    assert 0.6 < visible.mean() < 0.9
-
-
-def test_cameras_keep_people_upright():
-    R, _ = human_data.random_cameras(500, human_data.Views(), np.random.default_rng(0))
-    np.testing.assert_allclose(np.linalg.det(R), 1)
-    assert (R[:, 1, 1] < 0).all()  # world up is image up: y down in the image
-    assert len(CMU31) == 31
 
 
 # --- the journey: record, train, lift

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """2D training frames of people: CMU motion capture seen by random robot cameras and an imperfect detector.
 
-    python -m training.human_data CMU_FOLDER -o human2d.npz [--truth human3d.npz]
+    python -m training.human_data CMU_FOLDER -o human2d.npz [--truth human3d.npz] [--set KEY=VALUE ...]
 
 CMU_FOLDER holds npz files of CMU-31 joints: ``S_world`` (F,31,3) metres, y up, with ``trial_names`` and ``trial_len``,
 or ``S_root`` with ``seq_names`` and ``seq_len`` for root-relative clips.  Only the 2D file is for the trainer; the
@@ -11,35 +11,28 @@ or ``S_root`` with ``seq_names`` and ``seq_len`` for root-relative clips.  Only 
 from __future__ import annotations
 
 import argparse
+import io
 import json
-from dataclasses import asdict, dataclass
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import yaml
+from tqdm import tqdm
 
+from msg_adapters.keypoints import Intrinsics
 from paul_ros.files import write_atomically
-from training.mocap import CMU31, coco17_from_cmu31
+from paul_ros.model import enough_visible
+from paul_ros.placement import centred_view
+from training.cameras import Cameras, hidden_by_body, random_cameras
+from training.detector import detect, redefined, reported
+from training.mocap import CMU31, PARENTS, human_layout, human_points
+from training.view_settings import Views, ViewsError
 
 HELD_OUT = ("02", "03", "27", "29", "01_12", "01_13", "01_14", "05_17", "05_18", "05_19", "05_20")
 """Subjects and trials that no training frame comes from; those of 01 and 05 are the unseen split of the literature."""
-
-
-@dataclass(frozen=True)
-class Views:
-    """How the frames are seen; angles in degrees, distances in metres, noise in shares of the height in the image."""
-
-    motion: float = 10.0  # a frame is taken once a limb has turned by this much since the last one taken
-    views: int = 6  # random cameras a frame
-    elevation: tuple[float, float] = (-15.0, 40.0)  # from below and from above
-    roll: float = 5.0  # standard deviation
-    distance: tuple[float, float] = (2.5, 10.0)  # log-uniform
-    noise: float = 0.007  # standard deviation of most points ...
-    outlier_share: float = 0.03  # ... and of the few that a detector misplaces
-    outlier_noise: float = 0.06
-    swap_share: float = 0.005  # left and right limbs exchanged
-    hidden: float = 0.4  # up to this share of a view's points is missing at random
-    truncated: float = 0.15  # share of views that lose all points below (or above) a random line
-    seed: int = 0
 
 
 def read_clips(folder: Path) -> list[tuple[str, np.ndarray]]:
@@ -52,7 +45,7 @@ def read_clips(folder: Path) -> list[tuple[str, np.ndarray]]:
             ends = np.cumsum(archive[f"{kind}_len"])
             clips += zip(archive[f"{kind}_names"].tolist(), np.split(joints, ends[:-1]))
     if not clips:
-        raise SystemExit(f"no npz files of CMU joints in {folder}")
+        raise SystemExit(f"no npz files of CMU joints in '{folder}'")
     return clips
 
 
@@ -63,7 +56,7 @@ def training_clips(clips: list[tuple[str, np.ndarray]]) -> list[tuple[str, np.nd
     return [(name, joints) for name, joints in clips if not name.startswith(HELD_OUT) and not _is_copy(joints, known)]
 
 
-_PARENTS = {"femur": "hipjoint", "tibia": "femur", "humerus": "clavicle", "radius": "humerus"}
+_LIMBS = {"femur": "hipjoint", "tibia": "femur", "humerus": "clavicle", "radius": "humerus"}
 
 
 def _limbs(joints: np.ndarray) -> np.ndarray:
@@ -73,7 +66,7 @@ def _limbs(joints: np.ndarray) -> np.ndarray:
         [
             joints[:, index(side + bone)] - joints[:, index(side + parent)]
             for side in "lr"
-            for bone, parent in _PARENTS.items()
+            for bone, parent in _LIMBS.items()
         ],
         axis=1,
     )
@@ -107,99 +100,200 @@ def distinct_frames(joints: np.ndarray, motion: float) -> np.ndarray:
     return np.array(taken)
 
 
-def random_cameras(count: int, views: Views, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (N,3,3) from a y-up world to camera optical frames, and distances (N,) in metres."""
-    yaw = rng.uniform(0, 2 * np.pi, count)
-    pitch = np.deg2rad(rng.uniform(*views.elevation, count))
-    roll = np.deg2rad(rng.normal(0, views.roll, count))
-    to_optical = np.diag([1.0, -1.0, -1.0])  # y up to y down, and z into the scene
-    R = _turn(roll, 2) @ _turn(pitch, 0) @ to_optical @ _turn(yaw, 1)
-    return R, np.exp(rng.uniform(*np.log(views.distance), count))
+# Bones that are longer or shorter together, without the side letter.
+_SEGMENTS = (
+    ("femur",),
+    ("tibia",),
+    ("foot", "toes"),
+    ("hipjoint",),
+    ("lowerback", "upperback", "thorax"),
+    ("lowerneck", "upperneck"),
+    ("clavicle",),
+    ("humerus",),
+)
 
 
-def _turn(angle: np.ndarray, axis: int) -> np.ndarray:
-    """Rotations (N,3,3) about a coordinate axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R = np.tile(np.eye(3), (len(angle), 1, 1))
-    R[:, i, i] = R[:, j, j] = np.cos(angle)
-    R[:, j, i] = np.sin(angle)
-    R[:, i, j] = -R[:, j, i]
-    return R
+def other_people(joints: np.ndarray, views: Views, rng: np.random.Generator) -> np.ndarray:
+    """The poses (F,31,3) of people of other stature and proportions, each frame another one, roots where they were."""
+    factors = np.ones((len(joints), len(CMU31)))
+    for bones in _SEGMENTS:
+        own = [index for index, name in enumerate(CMU31) if name in bones or name[1:] in bones]
+        factors[:, own] = np.exp(views.proportions * rng.standard_normal((len(joints), 1)))
+    forearms = [CMU31.index(side + "radius") for side in "lr"]
+    factors[:, forearms] *= rng.uniform(*views.forearm, (len(joints), 1))
+    factors *= np.exp(views.stature * rng.standard_normal((len(joints), 1)))
+    grown = np.array(joints, dtype=float)
+    for bone, parent in enumerate(PARENTS):
+        if parent >= 0:
+            grown[:, bone] = grown[:, parent] + factors[:, bone, None] * (joints[:, bone] - joints[:, parent])
+    return grown
 
 
-def see(points: np.ndarray, views: Views, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Look at COCO-17 points (F,17,3), each frame with a camera of its own aimed at it.
+@dataclass(frozen=True)
+class Seen:
+    """N views of bodies, in the order of the layout ``human``.
 
-    Returns:
-        W (F,2,17) float32 normalised image points with noise, visible (F,17), and the true points (F,3,17) float32 in
-        the camera frame, centred.
+    Attributes:
+        W: (N,2,P) float32 rays (x/z, y/z), with the detector's errors, of virtual cameras turned to the visible points
+            as the Lifter turns them; 0 where hidden.
+        visible: (N,P).
+        S: (N,3,P) float32 the truth in those virtual cameras' frames, metres, centred on the mean of all points.
+        confidence: (N,P), 0 where hidden.
+        xy: (N,P,2) pixels, with the errors; NaN where hidden.
+        points: (N,P,3) the truth in the optical frame, metres.
+        cameras: the real cameras.
+        level: (N,) of the detector's errors. layout: (N,) index of its layout in ``views.layouts``.
     """
-    R, distance = random_cameras(len(points), views, rng)
-    S = R @ (points - points.mean(1, keepdims=True)).transpose(0, 2, 1)
-    W = S[:, :2] / (S[:, 2:] + distance[:, None, None])
-    height = np.ptp(W, axis=2).max(1)[:, None, None]
-    noise = np.where(rng.random((len(W), 1, 17)) < views.outlier_share, views.outlier_noise, views.noise)
-    W = _swapped(W, views, rng) + height * noise * rng.standard_normal(W.shape)
-    visible = rng.random((len(W), 17)) >= views.hidden * rng.random((len(W), 1))
-    return W.astype(np.float32), visible & _inside(W, views, rng), S.astype(np.float32)
+
+    W: np.ndarray
+    visible: np.ndarray
+    S: np.ndarray
+    confidence: np.ndarray
+    xy: np.ndarray
+    points: np.ndarray
+    cameras: Cameras
+    level: np.ndarray
+    layout: np.ndarray
 
 
-def _swapped(W: np.ndarray, views: Views, rng: np.random.Generator) -> np.ndarray:
-    """A few limb joints with left and right exchanged (COCO order: left at odd, right at the next even index)."""
-    W = W.copy()
-    for left in range(5, 17, 2):
-        rows = rng.random(len(W)) < views.swap_share
-        W[rows, :, left], W[rows, :, left + 1] = W[rows, :, left + 1], W[rows, :, left]
-    return W
+def see(points: np.ndarray, views: Views, rng: np.random.Generator) -> Seen:
+    """Look at bodies (N,P,3) of ``human`` in a y-up world, metres, each with a camera and a detector of its own."""
+    N = len(points)
+    cameras = random_cameras(points, views, rng)
+    truth = cameras.see(points)
+    level = rng.uniform(*views.level, N)
+    marked = redefined(truth, level, rng)
+    xy = cameras.project(marked)
+    inside = cameras.inside(marked, xy) if views.border else truth[..., 2] > 0
+    occluded = hidden_by_body(truth) if views.occlusion else np.zeros(inside.shape, bool)
+    found = detect(xy, _height(cameras, truth), occluded, level, views, rng)
+    missed = rng.random(inside.shape) < rng.uniform(*views.hidden, (N, 1))
+    found.visible[:] &= inside & ~missed & ~_covered(cameras.rays(xy), views, rng)
+    shares = np.array([share for _, share in views.layouts], float)
+    layout = rng.choice(len(shares), N, p=shares / shares.sum())
+    found = reported(found, layout, views)
+    return _turned(found.xy, found.confidence, found.visible, truth, cameras, level, layout)
 
 
-def _inside(W: np.ndarray, views: Views, rng: np.random.Generator) -> np.ndarray:
-    """(F,17): not cut off by an image border that a truncated view has below or above a random line."""
-    y = W[:, 1] - W[:, 1].min(1, keepdims=True)
-    border = rng.uniform(0.35, 1.0, (len(W), 1)) * y.max(1, keepdims=True)
-    below = rng.random((len(W), 1)) < 0.8
-    cut = rng.random((len(W), 1)) < views.truncated
-    return ~cut | np.where(below, y <= border, y >= y.max(1, keepdims=True) - border)
+def _turned(xy, confidence, visible, truth, cameras: Cameras, level, layout) -> Seen:
+    """The views as the Lifter takes them; where nothing is visible, turned to the whole body."""
+    some = visible | ~visible.any(1, keepdims=True)
+    view = centred_view(cameras.rays(xy), some, Intrinsics(1.0, 1.0, 0.0, 0.0, 0, 0))
+    visible = visible & np.isfinite(view.W).all(1)
+    S = (truth @ view.turn).transpose(0, 2, 1)
+    return Seen(
+        W=np.where(visible[:, None], view.W, 0).astype(np.float32),
+        visible=visible,
+        S=(S - S.mean(2, keepdims=True)).astype(np.float32),
+        confidence=np.where(visible, confidence, 0.0),
+        xy=np.where(visible[..., None], xy, np.nan),
+        points=truth,
+        cameras=cameras,
+        level=level,
+        layout=layout,
+    )
 
 
-def make(folder: Path, views: Views) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The 2D arrays of the training file, and the truth (F,3,17) of the same frames."""
+def _height(cameras: Cameras, truth: np.ndarray) -> np.ndarray:
+    """(N,) pixels: of the body in the image, or its width where that is more; as from afar, without perspective."""
+    span = np.ptp(truth[..., :2], axis=1).max(1)
+    return cameras.focal * span / np.linalg.norm(cameras.place, axis=1)
+
+
+def _covered(rays: np.ndarray, views: Views, rng: np.random.Generator) -> np.ndarray:
+    """(N,P): behind something in front of the body: beyond a line, from below as a table, from a side as a door."""
+    N = len(rays)
+    side = rng.choice(3, N, p=[0.7, 0.15, 0.15])
+    along = np.where((side == 0)[:, None], rays[..., 1], np.where((side == 1)[:, None], 1, -1) * rays[..., 0])
+    low, high = along.min(1, keepdims=True), along.max(1, keepdims=True)
+    line = low + rng.uniform(0.35, 1.0, (N, 1)) * (high - low)
+    return (rng.random((N, 1)) < views.obstacle) & (along > line)
+
+
+_BLOCK = 4096
+"""Views that are made together."""
+
+
+def make(
+    clips: list[tuple[str, np.ndarray]], views: Views, progress: Callable[[float], object] = lambda share: None
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The 2D arrays of the training file, and the truth (F,3,P) of the same frames.
+
+    Frames with too few visible points to be lifted are left out.
+    """
     rng = np.random.default_rng(views.seed)
-    clips = training_clips(read_clips(folder))
-    points = np.concatenate([coco17_from_cmu31(joints[distinct_frames(joints, views.motion)]) for _, joints in clips])
-    seen = [see(points, views, rng) for _ in range(views.views)]
-    W, visible, S = (np.concatenate(part) for part in zip(*seen))
+    joints = np.concatenate([joints[distinct_frames(joints, views.motion)] for _, joints in clips])
+    parts, drawn = [], views.views * len(joints)
+    for number, block in enumerate(_blocks(len(joints), views.views)):
+        seen = see(human_points(other_people(joints[block], views, rng)), views, rng)
+        enough = enough_visible(seen.visible, human_layout())
+        parts.append((seen.W[enough], seen.visible[enough], seen.S[enough]))
+        progress(min(1.0, (number + 1) * _BLOCK / drawn))
+    W, visible, S = (np.concatenate(arrays) for arrays in zip(*parts))
     about = {
         "source": "CMU motion capture (mocap.cs.cmu.edu)",
+        "layout": human_layout().name,
         "clips": [name for name, _ in clips],
-        "poses": len(points),
-        "views": asdict(views),
+        "poses": len(joints),
+        "views": views.to_dict(),
+        "left_out": drawn - len(W),
     }
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
     return {"W": W, "visible": visible, "calibrated": np.array(True), "about": text}, S
 
 
-def main() -> None:
+def _blocks(frames: int, times: int) -> Iterator[slice]:
+    for _ in range(times):
+        yield from (slice(begin, begin + _BLOCK) for begin in range(0, frames, _BLOCK))
+
+
+def main() -> int:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m training.human_data",
+        description=__doc__.split("\n")[0],
+        epilog="settings and their defaults:\n"
+        + yaml.safe_dump(Views().to_dict(), default_flow_style=None, sort_keys=False),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("folder", type=Path, help="npz files of CMU-31 joints")
     parser.add_argument("-o", "--output", type=Path, required=True, help="2D file for the trainer (.npz)")
     parser.add_argument("--truth", type=Path, help="3D truth of the same frames, for evaluation only (.npz)")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="change a setting of the views")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
     args = parser.parse_args()
-    arrays, truth = make(args.folder, Views())
+    try:
+        views = Views.from_dict(dict(_override(text) for text in args.set))
+    except ViewsError as error:
+        print(f"human_data: {error}", file=sys.stderr)
+        return 1
+    clips = training_clips(read_clips(args.folder))
+    with tqdm(
+        total=1.0, desc="views", disable=args.quiet, bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}"
+    ) as bar:
+        arrays, truth = make(clips, views, lambda done: bar.update(done - bar.n))
     _save(args.output, arrays)
     if args.truth:
         _save(args.truth, {**arrays, "S": truth})
     print(f"{args.output}: {len(truth)} frames, {1 - arrays['visible'].mean():.0%} of the points hidden")
+    return 0
+
+
+def _override(text: str) -> tuple[str, object]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ViewsError(f"'{text}' is no setting: write key=value")
+    try:
+        return key.strip(), yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ViewsError(f"the value in '{text}' is no YAML") from None
 
 
 def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    import io
-
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     write_atomically(path, buffer.getvalue())
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())
