@@ -186,6 +186,7 @@ def _add_benchmark(commands: argparse._SubParsersAction) -> None:
     subjects = parser.add_subparsers(metavar="SUBJECT", required=True)
     _add_benchmark_onp(subjects)
     _add_benchmark_nrsfm(subjects)
+    _add_benchmark_node(subjects)
 
 
 def _add_benchmark_onp(subjects: argparse._SubParsersAction) -> None:
@@ -345,6 +346,97 @@ def _benchmark_nrsfm(args: argparse.Namespace) -> None:
             benchmark.write_picture(args.plot, report)
     finally:
         print(benchmark.table(report))
+
+
+_NODE_COLUMNS = """\
+Publisher, node and listener are three processes that speak over DDS, on this machine only. The lifter is sent the poses
+of a shipped recording, spread over the image, as organised PointCloud2, and knows the camera. The echo node is what a
+tutorial would have: it makes a PoseArray of as many poses out of the same message and lifts nothing. Both take turns of
+about two seconds.
+
+columns, a line for each number of persons, rate and node; times in µs:
+  received  messages that were answered by a PoseArray, of those sent
+  median    from the publisher's stamp to the answer's arrival at the listener, which takes serialised messages;
+            then the 99th percentile
+  CPU       time that all threads of the node's process used, a frame
+  MB        resident memory after the last frame
+  x echo    the median over the echo node's; then the same of the 99th percentiles
+  + CPU     CPU time over that of the echo node
+Start to first output: from the start of the process, a detector already running; median of three.
+
+A machine that does other work besides tells more about that work: see the load.
+
+examples:
+  paul benchmark node
+  paul benchmark node --persons 1,10 --rates 100 --seconds 30 --json node.json --plot node.png
+  paul benchmark node --soak 30 --persons 10 --rates 100     is the memory flat after half an hour?
+"""
+
+
+def _add_benchmark_node(subjects: argparse._SubParsersAction) -> None:
+    parser = subjects.add_parser(
+        "node",
+        help="the ROS 2 node: latency, CPU time and memory, beside a node that does not lift",
+        description="Latency, CPU time and memory of the ROS 2 node, beside those of a node that does not lift.",
+        epilog=_NODE_COLUMNS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--persons", metavar="A,B", type=_positives, default=[1, 10, 50], help="in an image (default: 1,10,50)"
+    )
+    parser.add_argument("--rates", metavar="A,B", type=_positives, default=[30, 100], help="in Hz (default: 30,100)")
+    parser.add_argument(
+        "--seconds", metavar="S", type=_positive, default=10, help="for each line (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--soak",
+        metavar="MINUTES",
+        type=_minutes,
+        help="instead: the lifter alone for so long, with the most persons and the highest rate, memory over time",
+    )
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write all rows as JSON")
+    parser.add_argument("--plot", metavar="FILE.png", type=_picture, help="draw latencies and CPU times, or memory")
+    parser.set_defaults(run=_benchmark_node)
+
+
+def _positives(text: str) -> list[int]:
+    numbers = [_positive(word.strip()) for word in text.split(",")]
+    if len(set(numbers)) < len(numbers):
+        raise argparse.ArgumentTypeError(f"'{text}' names a number twice")
+    return numbers
+
+
+def _minutes(text: str) -> float:
+    try:
+        minutes = float(text)
+    except ValueError:
+        minutes = 0.0
+    if not 0 < minutes < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is no number of minutes above 0")
+    return minutes
+
+
+def _benchmark_node(args: argparse.Namespace) -> None:
+    from paul_ros.bag import check_outputs
+    from paul_ros.benchmarks import need
+    from paul_ros.report import write_json
+
+    need("tqdm", *(["matplotlib"] if args.plot else []))
+    from paul_ros.benchmarks.node import run, soak
+    from paul_ros.benchmarks.node_report import table, write_picture
+
+    check_outputs([args.json, args.plot], [])
+    if args.soak:
+        report = soak(max(args.persons), max(args.rates), args.soak)
+    else:
+        report = run(args.persons, args.rates, args.seconds)
+    try:
+        if args.json:
+            write_json(args.json, report)
+        if args.plot:
+            write_picture(args.plot, report)
+    finally:
+        print(table(report))
 
 
 _STUDIES = {
@@ -595,7 +687,13 @@ def _is_expected(error: Exception) -> bool:
     from paul_ros.skeleton import LayoutError
 
     expected: tuple = (BagError, DemoError, ImportError, LayoutError, ModelError, OSError, PictureError)
-    for module in ("training.cli", "training.evaluation", "training.experiments", "training.studies.interpolation"):
+    for module in (
+        "paul_ros.benchmarks.node",
+        "training.cli",
+        "training.evaluation",
+        "training.experiments",
+        "training.studies.interpolation",
+    ):
         if module in sys.modules:
             expected += sys.modules[module].ERRORS
     return isinstance(error, expected)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `paul benchmark node` found, for people: a table to print, and a picture."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from paul_ros.benchmarks import need
+from paul_ros.files import write_atomically
+from paul_ros.report import PictureError
+
+_COLOURS = {"lifter": "#1f77d0", "echo": "#9a9a9a"}
+_HEAD = (
+    f"  {'persons':>7}{'Hz':>6}  {'node':<8}{'sent':>7}{'received':>9}{'median':>9}{'99 %':>9}{'CPU':>9}{'MB':>7}"
+    f"{'x echo':>9}{'99 %':>7}{'+ CPU':>8}"
+)
+
+
+def table(report: dict) -> str:
+    """The report as text: a line for each node, number of persons and rate; times in µs."""
+    ratios = {(ratio["persons"], ratio["rate_hz"]): ratio for ratio in report["ratios"]}
+    lines = [_HEAD]
+    for row in report["rows"]:
+        line = _line(row)
+        if row["node"] == "lifter":
+            line += _ratio_cells(ratios.get((row["persons"], row["rate_hz"])))
+        lines.append(line)
+    starts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["start_to_first_output_s"].items())
+    machine = report["machine"]
+    lines += [
+        "",
+        f"  start to first output: {starts}",
+        f"  {machine['processor']}, {machine['cpus']} processors, load {machine['load_before']:.1f} before and "
+        f"{machine['load_after']:.1f} after",
+    ]
+    return "\n".join(lines + (_soak_lines(report["soak"]) if "soak" in report else []))
+
+
+def _line(row: dict) -> str:
+    return (
+        f"  {row['persons']:>7}{row['rate_hz']:>6g}  {row['node']:<8}{row['sent']:>7}{row['received']:>9}"
+        f"{_cell(row['latency_median_us'], 9)}{_cell(row['latency_p99_us'], 9)}{_cell(row['cpu_us_per_frame'], 9)}"
+        f"{row['rss_mb']:>7.1f}"
+    )
+
+
+def _ratio_cells(ratio: dict | None) -> str:
+    if ratio is None:
+        return ""
+    return (
+        f"{_cell(ratio['latency_median_ratio'], 9, 2)}{_cell(ratio['latency_p99_ratio'], 7, 2)}"
+        f"{_cell(ratio['cpu_added_us_per_frame'], 8)}"
+    )
+
+
+def _cell(value: float | None, width: int, digits: int = 0) -> str:
+    return f"{'-':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
+
+
+def _soak_lines(soak: dict) -> list[str]:
+    """Memory at some twenty times, and whether it grows."""
+    every = max(1, len(soak["memory"]) // 20)
+    growth = soak["growth_mb_per_hour"]
+    verdict = "too short to tell" if growth is None else f"{growth:+.2f} MB an hour in the second half"
+    return [
+        "",
+        "  minutes    MB",
+        *(f"  {at['s'] / 60:>7.1f}{at['rss_mb']:>8.2f}" for at in soak["memory"][::every]),
+        f"  at most {soak['rss_mb_max']:.2f} MB, {verdict}",
+    ]
+
+
+# --- the picture
+
+
+def write_picture(path: str | Path, report: dict) -> None:
+    """Bars of latency and CPU time for each number of persons and each rate; of a long run, its memory over time.
+
+    The suffix of the path chooses the format. Raises ImportError without matplotlib, PictureError for an odd suffix.
+    """
+    need("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    if "soak" in report:
+        _draw_memory(figure.subplots(), report)
+    else:
+        latency, cpu = figure.subplots(1, 2)
+        _draw_bars(latency, report["rows"], "latency_median_us", "latency_p99_us")
+        latency.set_title("Latency: bar the median, tick the 99th percentile", loc="left", fontweight="bold")
+        _draw_bars(cpu, report["rows"], "cpu_us_per_frame")
+        cpu.set_title("CPU time of the node's process", loc="left", fontweight="bold")
+        handles, names = latency.get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=2, frameon=False)
+    for ax in figure.axes:
+        ax.spines[["top", "right"]].set_visible(False)
+    buffer = io.BytesIO()
+    try:
+        figure.savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=110)
+    except ValueError as error:
+        raise PictureError(f"{path}: {error}") from error
+    write_atomically(path, buffer.getvalue())
+
+
+def _draw_bars(ax: Any, rows: list[dict], key: str, tick: str | None = None) -> None:
+    """A bar a row in µs, the nodes side by side; a log scale, for ten persons are ten times one."""
+    cells = list(dict.fromkeys((row["persons"], row["rate_hz"]) for row in rows))
+    for place, (name, colour) in enumerate(_COLOURS.items()):
+        own = [row for row in rows if row["node"] == name and row[key] is not None]
+        x = np.array([cells.index((row["persons"], row["rate_hz"])) for row in own]) + 0.4 * (place - 0.5)
+        label = "lifter" if name == "lifter" else "echo: the same messages, no lifting"
+        bars = ax.bar(x, [row[key] for row in own], 0.36, color=colour, label=label)
+        ax.bar_label(bars, [f"{row[key]:.0f}" for row in own], fontsize=8, padding=2)
+        if tick:
+            ax.scatter(x, [row[tick] for row in own], marker="_", s=160, color=colour, zorder=3)
+    ax.set_xticks(range(len(cells)), [f"{persons} at\n{rate:g} Hz" for persons, rate in cells], fontsize=9)
+    ax.set(yscale="log", ylabel="µs a frame", xlabel="persons, rate")
+
+
+def _draw_memory(ax: Any, report: dict) -> None:
+    memory, row = report["soak"]["memory"], report["rows"][0]
+    ax.plot([at["s"] / 60 for at in memory], [at["rss_mb"] for at in memory], color=_COLOURS["lifter"])
+    ax.set(xlabel="minutes", ylabel="MB resident", ylim=(0, 1.2 * report["soak"]["rss_mb_max"]))
+    ax.set_title(
+        f"Memory of the lifter, {row['persons']} persons at {row['rate_hz']:g} Hz, {row['sent']} frames sent, "
+        f"{row['received']} answered",
+        loc="left",
+        fontweight="bold",
+    )
