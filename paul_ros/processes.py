@@ -51,27 +51,42 @@ def process(
 
     log: a file for what it says, on stdout too unless `stdout` is another place for that.
     """
-    child = subprocess.Popen(
-        [sys.executable, "-m", *arguments],
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=log if stdout is None else stdout,
-        stderr=log,
-    )
+    with _no_interrupt() as interrupted:  # in the midst of this nobody would know the child's id yet
+        child = subprocess.Popen(
+            [sys.executable, "-m", *arguments],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=log if stdout is None else stdout,
+            stderr=log,
+        )
     try:
+        if interrupted:
+            raise KeyboardInterrupt
         yield child
         child.stdin.close()  # the player's sign to leave
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.wait(_PATIENCE)
     finally:
+        with contextlib.suppress(BrokenPipeError):
+            child.stdin.close()
         _end(child)
-        child.stdin.close()
+
+
+@contextlib.contextmanager
+def _no_interrupt() -> Iterator[list]:
+    """Ctrl-C raises nothing within the block; the list that is given then holds something."""
+    interrupted: list = []
+    before = signal.signal(signal.SIGINT, lambda *signalled: interrupted.append(signalled))
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _end(child: subprocess.Popen) -> None:
-    """By SIGINT, since a process that is killed leaves the middleware's shared memory behind; if need be by SIGKILL."""
+    """Asks first, since a process that is killed leaves the middleware's shared memory behind."""
     if child.poll() is None:
-        child.send_signal(signal.SIGINT)
+        child.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.wait(_LAST_PATIENCE)
     if child.poll() is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -65,7 +66,7 @@ def test_a_short_run(monkeypatch, tmp_path, capsys):
 
 
 def test_a_short_soak(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(node, "STARTS", 1)
+    monkeypatch.setattr(node, "first_outputs", lambda: {"lifter": 0.5})
     monkeypatch.setattr(node, "SOAK_SECONDS", 0.5)
     files = [tmp_path / "soak.json", tmp_path / "soak.png"]
     words = ["benchmark", "node", "--persons", "1,3", "--rates", "40,20", "--soak", "0.025"]
@@ -190,13 +191,14 @@ def test_ctrl_c_ends_every_process():
         cwd=ROOT,
         stderr=subprocess.PIPE,
         start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background has it ignored
     )
     try:
         end = time.monotonic() + 30
         while len(group(command.pid)) < 4:
             assert time.monotonic() < end and command.poll() is None
             time.sleep(0.05)
-        command.send_signal(2)
+        command.send_signal(signal.SIGINT)
         assert command.wait(30) == 130
         assert command.stderr.read().strip() == b"paul: stopped"
         assert not group(command.pid)

@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import select
-import signal
 import subprocess
 import tempfile
 import time
@@ -75,7 +74,7 @@ def run(persons: list[int], rates: list[int], seconds: float) -> dict:
         tqdm(total=total, unit="s", disable=None, dynamic_ncols=True, bar_format=_BAR) as bar,
         _bench(persons) as bench,
     ):
-        bench.start_all()
+        bench.start_all(*NODES)
         rows = []
         for count, rate in cells:
             bar.set_description(f"{count} persons, {rate:g} Hz")
@@ -95,7 +94,7 @@ def soak(persons: int, rate: float, minutes: float) -> dict:
         tqdm(total=seconds, unit="s", disable=None, dynamic_ncols=True, bar_format=_BAR) as bar,
         _bench([persons]) as bench,
     ):
-        bench.start_all()
+        bench.start_all("lifter")
         bar.set_description(f"soak, {persons} persons, {rate:g} Hz")
         bench.measure("lifter", persons, rate, _WARM_UP)
         turns, memory = [], [(0.0, bench.rss_mb("lifter"))]
@@ -213,11 +212,11 @@ class _Bench:
     def close(self) -> None:
         """Ends the nodes and both ends, so that none leaves the middleware's shared memory behind."""
         for child in (*self.nodes.values(), self.listener):
-            child.send_signal(signal.SIGINT)
+            child.terminate()
 
-    def start_all(self) -> None:
-        """Both nodes; the lifter knows the camera."""
-        for name in NODES:
+    def start_all(self, *names: str) -> None:
+        """Nodes, the lifter among them, which then knows the camera."""
+        for name in names:
             self.start(name)
         self._ask({"camera_info": str(self._folder / "camera_info.npy")})
 

@@ -13,7 +13,8 @@ from paul_ros.benchmarks import need
 from paul_ros.files import write_atomically
 from paul_ros.report import PictureError
 
-_COLOURS = {"lifter": "#1f77d0", "echo": "#9a9a9a"}
+_COLOURS = {"lifter": "#1f77d0", "echo": "#8a8a8a"}
+_LEAST_US = 100  # of the pictures' axes
 _HEAD = (
     f"  {'persons':>7}{'Hz':>6}  {'node':<8}{'sent':>7}{'received':>9}{'median':>9}{'99 %':>9}{'CPU':>9}{'MB':>7}"
     f"{'x echo':>9}{'99 %':>7}{'+ CPU':>8}"
@@ -86,7 +87,7 @@ def write_picture(path: str | Path, report: dict) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    figure = Figure(figsize=(12.5, 4.8), layout="constrained")
     FigureCanvasAgg(figure)
     if "soak" in report:
         _draw_memory(figure.subplots(), report)
@@ -113,14 +114,19 @@ def _draw_bars(ax: Any, rows: list[dict], key: str, tick: str | None = None) -> 
     cells = list(dict.fromkeys((row["persons"], row["rate_hz"]) for row in rows))
     for place, (name, colour) in enumerate(_COLOURS.items()):
         own = [row for row in rows if row["node"] == name and row[key] is not None]
-        x = np.array([cells.index((row["persons"], row["rate_hz"])) for row in own]) + 0.4 * (place - 0.5)
+        x = np.array([cells.index((row["persons"], row["rate_hz"])) for row in own]) + 0.42 * (place - 0.5)
         label = "lifter" if name == "lifter" else "echo: the same messages, no lifting"
-        bars = ax.bar(x, [row[key] for row in own], 0.36, color=colour, label=label)
-        ax.bar_label(bars, [f"{row[key]:.0f}" for row in own], fontsize=8, padding=2)
+        bars = ax.bar(x, [row[key] for row in own], 0.4, color=colour, label=label)
+        ax.bar_label(bars, [_short(row[key]) for row in own], fontsize=8, label_type="center", color="white")
         if tick:
-            ax.scatter(x, [row[tick] for row in own], marker="_", s=160, color=colour, zorder=3)
+            ax.scatter(x, [row[tick] for row in own], marker="_", s=200, color=colour, zorder=3)
     ax.set_xticks(range(len(cells)), [f"{persons} at\n{rate:g} Hz" for persons, rate in cells], fontsize=9)
-    ax.set(yscale="log", ylabel="µs a frame", xlabel="persons, rate")
+    ax.set(yscale="log", ylim=(_LEAST_US, None), ylabel="µs a frame", xlabel="persons, rate")
+
+
+def _short(value: float) -> str:
+    """At most four characters for what fits a bar."""
+    return f"{value:.0f}" if value < 10_000 else f"{value / 1000:.0f}k"
 
 
 def _draw_memory(ax: Any, report: dict) -> None:
