@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.model import Model, ModelError, enough_visible
-from paul_ros.onp import OnP, onp
-from paul_ros.placement import centred_view, place, undo_perspective
+from paul_ros.onp import onp
+from paul_ros.placement import centred_view, place
+from paul_ros.refine import refine
 
 TOO_FEW_POINTS = "too_few_points"
 DEGENERATE_POINTS = "degenerate_points"
@@ -18,6 +20,10 @@ TOO_FAR = "too_far"
 
 AMBIGUOUS = 0.9
 """From this ambiguity on the depth-reversed pose explains the image nearly as well."""
+
+_WILD, _WILD_EXTENT = 3.0, 0.25
+"""A point is taken for a misdetection where it is missed by more than so many medians of the person's points, and by
+more than this share of the person's extent (some 8 % of the height)."""
 
 MIN_EXTENT = 1.0
 """Pixels, root mean square distance of the visible points from their mean: below it an image says nothing of a pose."""
@@ -36,10 +42,13 @@ class Lifted:
         root: (N,3) the layout's root point, same frame and units.
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
-        reprojection: (N,) pixels, root mean square over the visible points (those within 60 degrees of the person).
+        reprojection: (N,) pixels, root mean square over the points used.
         ambiguity: (N,) 0..1, residual of the pose over that of its depth-reversed rival, the second optimum; 0 where
             there is none, 1 where the image cannot tell them apart.
-        certified: (N,) the pose is the proven optimum of orthographic-N-point.
+        certified: (N,) the pose, or what a pinhole camera's was refined from, is the proven optimum of
+            orthographic-N-point.
+        used: (N,P) bool, the points it was lifted from: visible, within 60 degrees of the person, and not so far from
+            where the lifted shape has them that a detector must have been wrong.
         reason: N slugs, '' where lifted, else why not: ``too_few_points``, fewer visible than the model asks for;
             ``degenerate_points``, they fix no pose: all on one line or, with intrinsics, an rms extent below
             ``MIN_EXTENT``; ``too_far``, in metres a coordinate would exceed ``MAX_DISTANCE``.
@@ -53,6 +62,7 @@ class Lifted:
     reprojection: np.ndarray
     ambiguity: np.ndarray
     certified: np.ndarray
+    used: np.ndarray
     reason: tuple[str, ...]
     units: str
 
@@ -63,7 +73,7 @@ class Lifted:
 
 
 class Lifter:
-    """Lifts every person of every frame on its own: encode, decode, orthographic-N-point, placement.
+    """Lifts every person of every frame on its own: encode, decode, orthographic-N-point, perspective, placement.
 
     Section 4.2 of the paper, "Prediction on unseen data".
     """
@@ -90,12 +100,14 @@ class Lifter:
             ValueError: the arrays do not have these shapes.
         """
         xy, visible = self._checked(xy, visible)
-        reason = np.where(enough_visible(visible, self.model.layout), "", TOO_FEW_POINTS).astype(object)
-        lifted = _nothing(len(xy), xy.shape[1], "m" if camera and self.model.metres_per_unit else "model")
-        rows = np.flatnonzero(reason == "")
-        if len(rows):
-            reason[rows] = self._lift_rows(xy[rows], visible[rows], camera, rows, lifted)
-        return Lifted(**lifted, reason=tuple(reason.tolist()))
+        rows = enough_visible(visible, self.model.layout)
+        if rows.all() and len(rows):
+            return self._lift_seen(xy, visible, camera)
+        lifted = _nothing(*visible.shape, self._units(camera))
+        return _replaced(lifted, rows, self._lift_seen(xy[rows], visible[rows], camera)) if rows.any() else lifted
+
+    def _units(self, camera: Intrinsics | None) -> str:
+        return "m" if camera and self.model.metres_per_unit else "model"
 
     def _checked(self, xy: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         xy, visible = np.asarray(xy, float), np.asarray(visible, bool)
@@ -107,56 +119,104 @@ class Lifter:
             )
         return xy, visible & np.isfinite(xy).all(2)
 
-    def _lift_rows(self, xy, visible, camera, rows, lifted) -> np.ndarray:
-        """Fill the given rows of the output arrays; returns why the others of them were not lifted, '' where done."""
+    def _lift_seen(self, xy: np.ndarray, visible: np.ndarray, camera: Intrinsics | None) -> Lifted:
+        """Persons of whom enough points are visible."""
         W, turn, pixels = xy.transpose(0, 2, 1), None, 1.0
         if camera is not None:
             view = centred_view(xy, visible, camera)
             W, turn, pixels = view.W, view.turn, (camera.fx + camera.fy) / 2
             visible = visible & np.isfinite(W).all(1)
+        fit = self._fit_sure(W, visible, camera is not None)
+        root, units, near = list(self.model.layout.root), self._units(camera), np.True_
+        shape = fit.R @ fit.S
+        if units == "m":
+            points = place(shape + fit.T[:, :, None], turn, self.model.metres_per_unit)
+            near = (np.abs(points) <= MAX_DISTANCE).all((1, 2))
+        else:
+            points = (shape - shape[:, :, root].mean(2, keepdims=True)).transpose(0, 2, 1)
+        # Again: a virtual camera does not see all points.
+        enough = enough_visible(visible, self.model.layout)
+        fixed = fit.fixed & (camera is None or fit.extent * pixels >= MIN_EXTENT)
+        lifted = Lifted(
+            points=points,
+            root=points[:, root].mean(1),
+            rotation=fit.R if turn is None else turn @ fit.R,
+            scale=pixels / fit.T[:, 2],
+            reprojection=pixels * fit.residual,
+            ambiguity=fit.ambiguity,
+            certified=fit.certified,
+            used=fit.used,
+            reason=("",) * len(xy),
+            units=units,
+        )
+        done = enough & fixed & near
+        if done.all():
+            return lifted
+        why = np.where(~enough, TOO_FEW_POINTS, np.where(~fixed, DEGENERATE_POINTS, TOO_FAR))[~done]
+        nothing = _nothing(len(why), visible.shape[1], units)
+        return _replaced(lifted, ~done, replace(nothing, reason=tuple(why.tolist())))
+
+    def _fit_sure(self, W: np.ndarray, visible: np.ndarray, pinhole: bool) -> _Fit:
+        """Fits, once more without the points that must be misdetections, where enough are left."""
+        fit = self._fit(W, visible, pinhole)
+        sure = visible & ~_wild(fit.missed, visible, fit.extent)
+        again = np.flatnonzero((sure != visible).any(1) & enough_visible(sure, self.model.layout))
+        if not len(again):
+            return fit
+        second = self._fit(W[again], sure[again], pinhole)
+        for value, new in zip(fit, second):
+            value[again] = new
+        return fit
+
+    def _fit(self, W: np.ndarray, visible: np.ndarray, pinhole: bool) -> _Fit:
+        """From image points (N,2,P): normalised ones of a pinhole camera, or any under weak perspective."""
         S = self.model.shape(W, visible).astype(float)
         pose = onp(S, W, visible)
-        if camera is not None:
-            # Once is enough: it leaves half a pixel and 5 mm of a person 2.5 m away, a tenth of that at 6 m.
-            pose = onp(S, undo_perspective(W, pose.R @ S, pose.scale), visible)
-        enough = enough_visible(visible, self.model.layout)  # again: a virtual camera does not see all points
-        fixed = pose.determined & (pose.scale > 0) & (camera is None or _extent(xy, visible) >= MIN_EXTENT)
-        points = self._placed(pose, S, fixed, turn if lifted["units"] == "m" else None)
-        near = (np.abs(points) <= MAX_DISTANCE).all((1, 2)) if lifted["units"] == "m" else True
-        done = enough & fixed & near
-        root = list(self.model.layout.root)
-        for name, value in (
-            ("points", points),
-            ("root", points[:, root].mean(1)),
-            ("rotation", pose.R if turn is None else turn @ pose.R),
-            ("scale", pose.scale * pixels),
-            ("reprojection", pose.residual * pixels),
-            ("ambiguity", pose.ambiguity),
-            ("certified", pose.certified),
-        ):
-            lifted[name][rows[done]] = value[done]
-        return np.where(~enough, TOO_FEW_POINTS, np.where(~fixed, DEGENERATE_POINTS, np.where(done, "", TOO_FAR)))
-
-    def _placed(self, pose: OnP, S: np.ndarray, fixed: np.ndarray, turn: np.ndarray | None) -> np.ndarray:
-        """Points (N,P,3): in metres where the camera's turn is given, else in model units from the root."""
-        shape = pose.R @ S
-        if turn is None:
-            return (shape - shape[:, :, list(self.model.layout.root)].mean(2, keepdims=True)).transpose(0, 2, 1)
-        scale = np.where(fixed, pose.scale, 1.0)
-        return place(shape, scale, pose.translation, turn, self.model.metres_per_unit)
+        fixed = pose.determined & (pose.scale > 0)
+        scale = np.where(fixed, pose.scale, 1.0)[:, None]
+        R, T = pose.R, np.concatenate([pose.translation, np.ones_like(scale)], axis=1) / scale
+        if pinhole:
+            R, T, missed = refine(S, W, visible, R, T)
+        else:
+            missed = np.where(visible[:, None], W - scale[..., None] * (R[:, :2] @ S + T[:, :2, None]), 0.0)
+        return _Fit(S, R, T, missed, visible.copy(), fixed, pose.ambiguity, pose.certified.copy(), pose.extent)
 
 
-def _extent(xy: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """(N,) root mean square distance of the visible points of (N,P,2) from their mean; 0 where there are none."""
-    seen = visible[..., None]
-    count = np.maximum(visible.sum(1), 1)[:, None]
-    mean = np.where(seen, xy, 0.0).sum(1) / count
-    return np.sqrt((np.where(seen, xy - mean[:, None], 0.0) ** 2).sum((1, 2)) / count[:, 0])
+class _Fit(NamedTuple):
+    """N shapes (N,3,P) and their poses, in model units: R (N,3,3), T (N,3), T[2] the inverse of the scale.
+
+    missed: (N,2,P) image points less those of the model; used: (N,P) the points it was made from; fixed: (N,), they
+    determine a pose; extent: (N,) root mean square distance of the image points from their mean.
+    """
+
+    S: np.ndarray
+    R: np.ndarray
+    T: np.ndarray
+    missed: np.ndarray
+    used: np.ndarray
+    fixed: np.ndarray
+    ambiguity: np.ndarray
+    certified: np.ndarray
+    extent: np.ndarray
+
+    @property
+    def residual(self) -> np.ndarray:
+        """(N,) root mean square of what is missed at the points used."""
+        return np.sqrt((self.missed**2).sum((1, 2)) / np.maximum(self.used.sum(1), 1))
 
 
-def _nothing(N: int, P: int, units: str) -> dict:
-    """Output arrays of N persons, none lifted yet."""
-    return dict(
+def _wild(missed: np.ndarray, visible: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """(N,P) bool: visible points that the found shape misses so far that a detector must have been wrong."""
+    square = np.where(visible, (missed * missed).sum(1), np.inf)
+    middle = np.maximum(visible.sum(1) - 1, 0) // 2
+    median = np.sort(square, axis=1)[np.arange(len(square)), middle]
+    limit = np.maximum(_WILD**2 * median, _WILD_EXTENT**2 * extent**2)
+    return visible & (square > limit[:, None])
+
+
+def _nothing(N: int, P: int, units: str) -> Lifted:
+    """N persons that were not lifted, for want of points."""
+    return Lifted(
         points=np.full((N, P, 3), np.nan),
         root=np.full((N, 3), np.nan),
         rotation=np.tile(np.eye(3), (N, 1, 1)),
@@ -164,5 +224,17 @@ def _nothing(N: int, P: int, units: str) -> dict:
         reprojection=np.full(N, np.nan),
         ambiguity=np.full(N, np.nan),
         certified=np.zeros(N, bool),
+        used=np.zeros((N, P), bool),
+        reason=(TOO_FEW_POINTS,) * N,
         units=units,
     )
+
+
+def _replaced(lifted: Lifted, rows: np.ndarray, others: Lifted) -> Lifted:
+    """lifted with the rows (N,) bool taken from the persons of others, in their order."""
+    mixed = {}
+    for name, value in vars(lifted).items():
+        if name != "units":
+            mixed[name] = np.array(value, object) if name == "reason" else value.copy()
+            mixed[name][rows] = getattr(others, name)
+    return replace(lifted, **{**mixed, "reason": tuple(mixed["reason"])})

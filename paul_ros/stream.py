@@ -12,7 +12,7 @@ import functools
 import logging
 import time
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,8 +42,8 @@ _log = logging.getLogger(__name__)
 class Frame:
     """One lifted message.
 
-    header: the input's own header; keypoints: its N persons, low confidences hidden; lifted: their 3D, both in the
-    layout of the output; given: the keypoints in the model's layout, as they were lifted; bone_width in the units of
+    header: the input's own header; keypoints: its N persons, hidden what was not used; lifted: their 3D, both in the
+    layout of the output; given: the keypoints in the model's layout, low confidences hidden; bone_width in the units of
     the points.
     """
 
@@ -271,7 +271,9 @@ class LiftStream:
         model, route = self.lifter.model, self.route
         unit = model.metres_per_unit if lifted.units == "m" else 1.0
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
-        return Frame(header, route.keypoints_out(given), route.lifted_out(lifted), route.output, given, width)
+        visible = np.where(lifted.ok[:, None], lifted.used, given.visible)
+        used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))
+        return Frame(header, route.keypoints_out(used), route.lifted_out(lifted), route.output, given, width)
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:
         start = time.perf_counter_ns()

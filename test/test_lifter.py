@@ -46,14 +46,14 @@ def everything(points):
     return np.ones(points.shape[:2], bool)
 
 
-@pytest.mark.parametrize("position", [[0, 0, 6], [2.5, 0.3, 6], [-2, -0.5, 5]])
+@pytest.mark.parametrize("position", [[0, 0, 6], [2.5, 0.3, 6], [-2, -0.5, 5], [0, 0, 1.5], [0.5, 0.3, 1.5]])
 def test_a_known_shape_is_put_where_it_stands(rigid_lifter, model, position):
     truth = standing(model, position, turn=0.5)
     lifted = rigid_lifter.lift(pinhole(truth), everything(truth), CAMERA)
     assert lifted.units == "m" and lifted.ok.all() and lifted.certified.all()
-    np.testing.assert_allclose(lifted.points, truth, atol=0.005)
-    np.testing.assert_allclose(lifted.root, truth[:, [11, 12]].mean(1), atol=0.005)
-    assert lifted.reprojection < 0.5  # pixels
+    np.testing.assert_allclose(lifted.points, truth, atol=0.003)
+    np.testing.assert_allclose(lifted.root, truth[:, [11, 12]].mean(1), atol=0.003)
+    assert lifted.reprojection < 0.2  # pixels
 
 
 def test_off_centre_persons_are_not_bent(rigid_lifter, model):
@@ -201,3 +201,24 @@ def test_one_wild_detection_does_not_turn_the_virtual_camera_away(model):
     xy[0, 0] = [9e5, -9e5]
     lifted = Lifter(model.rigid()).lift(xy, everything(truth), CAMERA)
     assert lifted.ok.all() and np.linalg.norm(lifted.root - truth[:, [11, 12]].mean(1)) < 0.1
+
+
+@pytest.mark.parametrize("camera", [CAMERA, None])
+def test_what_a_detector_got_wrong_is_not_used(rigid_lifter, model, camera):
+    """One wrist taken from another person: the rest is lifted as if it had been hidden."""
+    truth = np.concatenate([standing(model, [0, 0, 4], turn=turn) for turn in (0.3, 0.3, 0.6)])
+    xy = pinhole(truth)
+    xy[0, 9] += (50, 30)
+    visible = everything(truth)
+    lifted = rigid_lifter.lift(xy, visible, camera)
+    assert not lifted.used[0, 9] and lifted.used.sum() == 3 * 17 - 1
+    hidden = visible.copy()
+    hidden[0, 9] = False
+    np.testing.assert_allclose(lifted.points, rigid_lifter.lift(xy, hidden, camera).points, atol=1e-4)
+
+
+def test_points_that_all_fit_are_all_used(rigid_lifter, model):
+    """However small the misses are beside each other: noise of a hundredth of a pixel makes no misdetections."""
+    truth = np.concatenate([standing(model, [0, 0, 4])] * 50)
+    xy = pinhole(truth) + np.random.default_rng(0).standard_t(1, (50, 17, 2)).clip(-20, 20) * 0.01
+    assert rigid_lifter.lift(xy, everything(truth), CAMERA).used.all()
