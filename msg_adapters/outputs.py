@@ -40,22 +40,28 @@ def keypoints_cloud(make, header, xy: np.ndarray, confidence: np.ndarray, person
     """
     persons, points = confidence.shape
     ids = np.broadcast_to(id_numbers(person_ids)[:, None], (persons, points))
-    return _cloud(make, header, ("x", "y", "confidence", "person_id"), [xy[..., 0], xy[..., 1], confidence, ids])
+    columns = [xy[..., 0], xy[..., 1], confidence, ids]
+    return _cloud(make, header, ("x", "y", "confidence", "person_id"), columns, bool(np.isfinite(xy).all()))
 
 
-def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids):
-    """3D keypoints as an organised cloud, persons x P: x, y, z, confidence, keypoint (index), person_id.
+def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids, ambiguity, distance_sigma):
+    """3D keypoints as an organised cloud, persons x P: x, y, z, confidence, keypoint (index); equal for all points of a
+    person: person_id, ambiguity, distance_sigma.
 
-    points (N, P, 3) in the camera's optical frame; confidence (N, P), 0 where the keypoint was not seen.
+    points (N, P, 3) in the camera's optical frame; confidence (N, P), 0 where the keypoint was not seen; ambiguity (N,)
+    0..1; distance_sigma (N,) metres, NaN where there are none.
     """
     persons, count = confidence.shape
     keypoint = np.broadcast_to(np.arange(count), (persons, count))
-    person = np.broadcast_to(id_numbers(ids)[:, None], (persons, count))
+    each = [
+        np.broadcast_to(column[:, None], (persons, count)) for column in (id_numbers(ids), ambiguity, distance_sigma)
+    ]
     return _cloud(
         make,
         header,
-        ("x", "y", "z", "confidence", "keypoint", "person_id"),
-        [points[..., 0], points[..., 1], points[..., 2], confidence, keypoint, person],
+        ("x", "y", "z", "confidence", "keypoint", "person_id", "ambiguity", "distance_sigma"),
+        [points[..., 0], points[..., 1], points[..., 2], confidence, keypoint, *each],
+        is_dense=bool(np.isfinite(points).all()),
     )
 
 
@@ -108,8 +114,8 @@ def _id_number(text: str, row: int) -> int:
     return int(digits) if known else row
 
 
-def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray]):
-    """An organised float32 PointCloud2 of columns, each (height, width)."""
+def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray], is_dense: bool):
+    """An organised float32 PointCloud2 of columns, each (height, width); is_dense: no coordinate is NaN."""
     data = np.stack(columns, axis=-1).astype("<f4")
     height, width, count = data.shape
     fields = [
@@ -126,7 +132,7 @@ def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray]):
         point_step=4 * count,
         row_step=4 * count * width,
         data=make.octets(data.tobytes()),
-        is_dense=bool(np.isfinite(data).all()),
+        is_dense=is_dense,
     )
 
 

@@ -63,6 +63,9 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
         help="layout of what is written and judged: a name, a .yaml, or model (default: as of the node's parameter)",
     )
     parser.add_argument(
+        "--person-height", type=float, metavar="METRES", help="of the people in the bag (default: the model's adults)"
+    )
+    parser.add_argument(
         "--topic",
         default="/keypoints",
         help="2D keypoints (default: %(default)s); * is any part of a name, as in '/humans/bodies/*/skeleton2d'",
@@ -91,7 +94,9 @@ def _replay(args: argparse.Namespace) -> None:
     check_outputs([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic)
     with Ticker("replay") as tick:
-        stream = open_stream(args.model, args.layout, output_layout=args.output_layout)
+        stream = open_stream(
+            args.model, args.layout, output_layout=args.output_layout, person_height=args.person_height
+        )
         done = replay(args.bag, stream, args.output, topics, tick)
     report = evaluate(done)
     if args.json:

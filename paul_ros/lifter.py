@@ -25,6 +25,10 @@ _WILD, _WILD_EXTENT = 3.0, 0.25
 """A point is taken for a misdetection where it is missed by more than so many medians of the person's points, and by
 more than this share of the person's extent (some 8 % of the height)."""
 
+HEIGHT_SPREAD = 0.06
+"""Standard deviation of the heights of adults over their mean: men 175.3, women 161.3 cm, each with one of some 7.3 cm
+(Fryar et al., Anthropometric Reference Data, United States 2015-2018, Vital and Health Statistics 3(46), 2021)."""
+
 MIN_EXTENT = 1.0
 """Pixels, root mean square distance of the visible points from their mean: below it an image says nothing of a pose."""
 
@@ -47,6 +51,9 @@ class Lifted:
             there is none, 1 where the image cannot tell them apart.
         certified: (N,) the pose, or what a pinhole camera's was refined from, is the proven optimum of
             orthographic-N-point.
+        distance_sigma: (N,) metres, standard deviation of the root's distance: that of people's heights, unless the
+            height is known, and of the fit, the reprojection over the rms extent of the points used, which the
+            distances of the bags' persons are found to be wrong by. NaN in model units.
         used: (N,P) bool, the points it was lifted from: visible, within 60 degrees of the person, and not so far from
             where the lifted shape has them that a detector must have been wrong.
         reason: N slugs, '' where lifted, else why not: ``too_few_points``, fewer visible than the model asks for;
@@ -62,6 +69,7 @@ class Lifted:
     reprojection: np.ndarray
     ambiguity: np.ndarray
     certified: np.ndarray
+    distance_sigma: np.ndarray
     used: np.ndarray
     reason: tuple[str, ...]
     units: str
@@ -78,14 +86,37 @@ class Lifter:
     Section 4.2 of the paper, "Prediction on unseen data".
     """
 
-    def __init__(self, model: Model) -> None:
-        """Raises ModelError: the model is of one fixed scale, which no camera's image has."""
+    def __init__(self, model: Model, person_height: float = 0.0) -> None:
+        """person_height: see that property. Raises ModelError: the model is of one fixed scale, which no image has."""
         if model.scale != "free":
             raise ModelError(
                 f"model '{model.name}' is for orthographic data of one fixed scale: judge it with `paul evaluate`, "
                 f"or train a model to lift with by a recipe with scale: free"
             )
         self.model = model
+        self.person_height = person_height
+
+    @property
+    def person_height(self) -> float:
+        """Metres, the height that people are known to have; 0 = unknown, and the model's stature taken for it.
+
+        Raises ModelError where it is set and the model does not tell the stature it has its metres from.
+        """
+        return self._person_height
+
+    @person_height.setter
+    def person_height(self, height: float) -> None:
+        if height and not (self.model.stature and self.model.metres_per_unit):
+            raise ModelError(
+                f"model '{self.model.name}' does not tell the stature that its metres are of, so person_height cannot "
+                "change them: leave it at 0"
+            )
+        self._person_height = height
+        # What is no person has the size that the model gives it.
+        self.size_spread = HEIGHT_SPREAD if self.model.stature and not height else 0.0
+        self.metres_per_unit = self.model.metres_per_unit
+        if height:
+            self.metres_per_unit *= height / self.model.stature
 
     def lift(self, xy: np.ndarray, visible: np.ndarray, camera: Intrinsics | None = None) -> Lifted:
         """Lift N persons.
@@ -107,7 +138,7 @@ class Lifter:
         return _replaced(lifted, rows, self._lift_seen(xy[rows], visible[rows], camera)) if rows.any() else lifted
 
     def _units(self, camera: Intrinsics | None) -> str:
-        return "m" if camera and self.model.metres_per_unit else "model"
+        return "m" if camera and self.metres_per_unit else "model"
 
     def _checked(self, xy: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         xy, visible = np.asarray(xy, float), np.asarray(visible, bool)
@@ -130,7 +161,7 @@ class Lifter:
         root, units, near = list(self.model.layout.root), self._units(camera), np.True_
         shape = fit.R @ fit.S
         if units == "m":
-            points = place(shape + fit.T[:, :, None], turn, self.model.metres_per_unit)
+            points = place(shape + fit.T[:, :, None], turn, self.metres_per_unit)
             near = (np.abs(points) <= MAX_DISTANCE).all((1, 2))
         else:
             points = (shape - shape[:, :, root].mean(2, keepdims=True)).transpose(0, 2, 1)
@@ -145,6 +176,7 @@ class Lifter:
             reprojection=pixels * fit.residual,
             ambiguity=fit.ambiguity,
             certified=fit.certified,
+            distance_sigma=self._sigma(points[:, root].mean(1), fit, units),
             used=fit.used,
             reason=("",) * len(xy),
             units=units,
@@ -155,6 +187,12 @@ class Lifter:
         why = np.where(~enough, TOO_FEW_POINTS, np.where(~fixed, DEGENERATE_POINTS, TOO_FAR))[~done]
         nothing = _nothing(len(why), visible.shape[1], units)
         return _replaced(lifted, ~done, replace(nothing, reason=tuple(why.tolist())))
+
+    def _sigma(self, root: np.ndarray, fit: _Fit, units: str) -> np.ndarray:
+        if units != "m":
+            return np.full(len(root), np.nan)
+        wrong = fit.residual / np.maximum(fit.extent, 1e-12)
+        return np.sqrt((root * root).sum(1) * (self.size_spread**2 + wrong * wrong))
 
     def _fit_sure(self, W: np.ndarray, visible: np.ndarray, pinhole: bool) -> _Fit:
         """Fits, once more without the points that must be misdetections, where enough are left."""
@@ -224,6 +262,7 @@ def _nothing(N: int, P: int, units: str) -> Lifted:
         reprojection=np.full(N, np.nan),
         ambiguity=np.full(N, np.nan),
         certified=np.zeros(N, bool),
+        distance_sigma=np.full(N, np.nan),
         used=np.zeros((N, P), bool),
         reason=(TOO_FEW_POINTS,) * N,
         units=units,

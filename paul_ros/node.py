@@ -28,7 +28,7 @@ from collections import Counter
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
@@ -96,7 +96,7 @@ class LifterNode(Node):
         values = self._declare_parameters()
         self.stream = self._open_stream(values)
         self._told = self.stream.route
-        self.add_post_set_parameters_callback(self._take_parameters)
+        self.add_on_set_parameters_callback(self._take_parameters)
         self._outputs = {
             name: self.create_publisher(message_class(type_name), f"~/{name}", _OUTPUT_QOS)
             for name, type_name in OUTPUTS.items()
@@ -138,10 +138,16 @@ class LifterNode(Node):
             )
         return open_stream(**values)
 
-    def _take_parameters(self, parameters) -> None:
-        for parameter in parameters:
-            if parameter.name in LIVE:
-                setattr(self.stream, parameter.name, parameter.value)
+    def _take_parameters(self, parameters) -> SetParametersResult:
+        """Sets those that may change; one that the model cannot have is refused with the reason."""
+        try:
+            for parameter in parameters:
+                if parameter.name in LIVE:
+                    setattr(self.stream, parameter.name, parameter.value)
+        except ModelError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self._publish_layout()
+        return SetParametersResult(successful=True)
 
     # --- topics
 

@@ -40,6 +40,13 @@ PARAMETERS = (
         "Message type of `keypoints`, as sensor_msgs/msg/PointCloud2; "
         "auto = the type of the first publisher that can be read.",
     ),
+    Parameter(
+        "person_height",
+        0.0,
+        "Metres, the height of the people in view where it is known, as of children; 0 = the model's adults.",
+        (0.0, 3.0),
+        live=True,
+    ),
     Parameter("min_confidence", 0.3, "Keypoints with a lower confidence count as hidden.", (0.0, 1.0), live=True),
     Parameter(
         "max_persons", 64, "Messages with more persons are dropped, counted as too_many_persons.", (1, 10000), live=True
@@ -50,6 +57,15 @@ PARAMETERS = (
 LIVE = tuple(parameter.name for parameter in PARAMETERS if parameter.live)
 #: Name -> default.
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
+
+
+def checked(values: dict) -> dict:
+    """Values of parameters by name, the others' defaults added; raises ValueError for a number out of its limits."""
+    for parameter in PARAMETERS:
+        value, (low, high) = values.get(parameter.name, parameter.default), parameter.limits or (None, None)
+        if parameter.limits and not low <= value <= high:
+            raise ValueError(f"{parameter.name} is {value}; it must lie from {low} to {high}")
+    return {**DEFAULTS, **values}
 
 
 def as_yaml() -> str:

@@ -257,6 +257,7 @@ def evaluate(done: Replay) -> dict:
         "ambiguous_share": _mean([lift.ambiguity[good] >= AMBIGUOUS for lift, good in zip(lifts, ok)]),
         "lift_us_median": _number(np.median(times)),
         "lift_us_p99": _number(np.percentile(times, 99)),
+        **_doubt(done),
         "baseline": errors(with_truth(done, rigid_frames(done)), done.layout.root),
         "model": model.name,
         "model_sha256": model.sha256,
@@ -265,6 +266,27 @@ def evaluate(done: Replay) -> dict:
         "damage": str(done.damage) if done.damage else None,
         "versions": versions(),
     }
+
+
+def _doubt(done: Replay) -> dict:
+    """Of distance_sigma the median, and the shares of persons whose distance is wrong by at most once or twice that."""
+    metric = [frame for frame in done.frames if frame.lifted.units == "m"]
+    shares = []
+    for frame in metric:
+        if len(done.truth.get(frame.stamp, ())) == len(frame.lifted.ok) > 0:
+            root = done.truth[frame.stamp][:, list(done.layout.root)].mean(1)
+            judged = frame.lifted.ok & np.isfinite(root).all(1)
+            off = np.abs(_length(frame.lifted.root) - _length(root))
+            shares.append((off / frame.lifted.distance_sigma)[judged])
+    return {
+        "distance_sigma_median_m": _median([frame.lifted.distance_sigma[frame.lifted.ok] for frame in metric]),
+        "distance_within_1_sigma_share": _mean([share <= 1 for share in shares]),
+        "distance_within_2_sigma_share": _mean([share <= 2 for share in shares]),
+    }
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(vectors, axis=-1)
 
 
 def rigid_frames(done: Replay) -> list[LiftedFrame]:

@@ -20,7 +20,7 @@ import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, outputs
 from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
 from paul_ros.model import load_model
-from paul_ros.parameters import DEFAULTS
+from paul_ros.parameters import checked
 from paul_ros.route import MODEL, Route, read_unknown
 from paul_ros.skeleton import Layout, layout_names, load_layout
 
@@ -68,7 +68,15 @@ class Frame:
     def _keypoints3d(self, make, ok: np.ndarray):
         # An id that is no number becomes its row of the input, so rows are numbered before any is left out.
         ids = outputs.id_numbers(self.keypoints.ids)[ok]
-        return outputs.points_cloud(make, self.header, self.lifted.points[ok], self.keypoints.confidence[ok], ids)
+        return outputs.points_cloud(
+            make,
+            self.header,
+            self.lifted.points[ok],
+            self.keypoints.confidence[ok],
+            ids,
+            self.lifted.ambiguity[ok],
+            self.lifted.distance_sigma[ok],
+        )
 
     def _markers(self, make, ok: np.ndarray):
         return outputs.skeleton_markers(
@@ -93,14 +101,14 @@ OUTPUTS = {
 def open_stream(model: str | None = None, layout: str | None = None, **parameters) -> LiftStream:
     """The stream of the node's parameters; one that is left out, or None, has its default.
 
-    Raises ModelError, LayoutError.
+    Raises ModelError, LayoutError, ValueError.
     """
     given = {"model": model, "layout": layout, **parameters}
-    values = {**DEFAULTS, **{name: value for name, value in given.items() if value is not None}}
+    values = checked({name: value for name, value in given.items() if value is not None})
     loaded = load_model(values["model"])
     output = values["output_layout"]
     return LiftStream(
-        Lifter(loaded),
+        Lifter(loaded, values["person_height"]),
         load_layout(values["layout"]) if values["layout"] else None,
         values["min_confidence"],
         values["max_persons"],
@@ -152,6 +160,15 @@ class LiftStream:
     def route(self) -> Route:
         """The layouts that points go through; as if the input had the model's own until its layout is known."""
         return self._known or self._nobody
+
+    @property
+    def person_height(self) -> float:
+        """The lifter's; raises ModelError where it is set and the model cannot have it."""
+        return self.lifter.person_height
+
+    @person_height.setter
+    def person_height(self, height: float) -> None:
+        self.lifter.person_height = height
 
     @property
     def units(self) -> str:
@@ -230,10 +247,12 @@ class LiftStream:
             "units": self.units,
             "frame": "header.frame_id of the input, an optical frame (REP-103): x right, y down, z forward",
             "scale_source": _scale_source(self.intrinsics, model.metres_per_unit),
+            "person_height": self.person_height or model.stature,
+            "size_spread": self.lifter.size_spread,
             "chirality": model.header.get("chirality"),
             "model": model.name,
             "model_sha256": model.sha256,
-            "metres_per_unit": model.metres_per_unit,
+            "metres_per_unit": self.lifter.metres_per_unit,
         }
 
     def _read(self, type_name: str, msg, topic: str) -> Keypoints2D:
@@ -269,7 +288,7 @@ class LiftStream:
         for reason in filter(None, lifted.reason):
             self._drop("person_" + reason, f"{_LEFT_OUT[reason]}; this person is left out of the outputs")
         model, route = self.lifter.model, self.route
-        unit = model.metres_per_unit if lifted.units == "m" else 1.0
+        unit = self.lifter.metres_per_unit if lifted.units == "m" else 1.0
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
         visible = np.where(lifted.ok[:, None], lifted.used, given.visible)
         used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))

@@ -121,6 +121,7 @@ def model_file(tmp_path_factory) -> Path:
         "layout": layout.to_dict(),
         "bottleneck": 2,
         "metres_per_unit": metres,
+        "stature": 1.7,
         "chirality": {"known": True, "source": "made by hand"},
         "architecture": {
             "encoder": {"kind": "residual", "width": 4, "blocks": 1},

@@ -421,11 +421,24 @@ def test_points_cloud_writer(make, bag_make):
     points = np.random.default_rng(2).normal(size=(3, P, 3)).astype(np.float32)
     confidence = np.full((3, P), 0.5)
     msg = written(
-        make, bag_make, outputs.points_cloud(make, header_of(make), points, confidence, ("7", "anna", "99999999999"))
+        make,
+        bag_make,
+        outputs.points_cloud(
+            make,
+            header_of(make),
+            points,
+            confidence,
+            ("7", "anna", "99999999999"),
+            np.array([0.0, 0.5, 1.0]),
+            np.array([0.1, 0.2, np.nan]),
+        ),
     )
-    assert (msg.height, msg.width, msg.point_step, msg.row_step) == (3, P, 24, 24 * P)
-    assert [field.name for field in msg.fields] == ["x", "y", "z", "confidence", "keypoint", "person_id"]
-    data = np.frombuffer(msg.data, "<f4").reshape(3, P, 6)
+    assert (msg.height, msg.width, msg.point_step, msg.row_step) == (3, P, 32, 32 * P)
+    names = ["x", "y", "z", "confidence", "keypoint", "person_id", "ambiguity", "distance_sigma"]
+    assert [field.name for field in msg.fields] == names
+    data = np.frombuffer(msg.data, "<f4").reshape(3, P, 8)
+    np.testing.assert_array_equal(data[..., 6], np.tile(np.float32([[0], [0.5], [1]]), P))
+    np.testing.assert_array_equal(data[:, 3, 7], np.float32([0.1, 0.2, np.nan]))
     np.testing.assert_array_equal(data[..., :3], points)
     np.testing.assert_array_equal(data[..., 3], 0.5)
     np.testing.assert_array_equal(data[..., 4], np.tile(np.arange(P), (3, 1)))
@@ -480,7 +493,9 @@ def test_markers_are_two_packed_lists_with_sides_and_hidden_points(make, bag_mak
 def test_nobody_is_written_as_empty_messages(make, bag_make):
     nobody, nothing = np.empty((0, P, 3)), np.empty((0, P))
     assert len(written(make, bag_make, outputs.pose_array(make, header_of(make), nobody)).poses) == 0
-    cloud = written(make, bag_make, outputs.points_cloud(make, header_of(make), nobody, nothing, ()))
+    cloud = written(
+        make, bag_make, outputs.points_cloud(make, header_of(make), nobody, nothing, (), np.empty(0), np.empty(0))
+    )
     assert (cloud.height, cloud.width, len(cloud.data)) == (0, P, 0)
     markers = written(
         make, bag_make, outputs.skeleton_markers(make, header_of(make), nobody, nothing > 0, [(0, 1)], ("",) * P, 0.02)

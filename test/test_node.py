@@ -244,9 +244,9 @@ def test_outputs_agree_with_each_other(bench):
     seconds = bench.send(good())
     poses, points, markers = (bench.answer(name, seconds) for name in ("poses", "keypoints3d", "markers"))
     xyz = np.array([(p.position.x, p.position.y, p.position.z) for p in poses.poses])
-    data = np.frombuffer(points.data, "<f4").reshape(points.height, points.width, 6)
+    data = np.frombuffer(points.data, "<f4").reshape(points.height, points.width, 8)
     np.testing.assert_allclose(data[0, :, :3], xyz, atol=1e-5)
-    np.testing.assert_array_equal(data[0, :, 3:], [(1, keypoint, 0) for keypoint in range(17)])
+    np.testing.assert_array_equal(data[0, :, 3:6], [(1, keypoint, 0) for keypoint in range(17)])
     spheres = np.array([(p.x, p.y, p.z) for p in markers.markers[1].points])
     np.testing.assert_array_equal(spheres, xyz)
 

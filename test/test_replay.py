@@ -107,7 +107,7 @@ def test_report_keys_and_counts(model_file):
     assert report["persons_with_truth"] == report["lifted"]
     assert json.loads(json.dumps(report)) == report
     # The model of the tests is rigid, so it is its own baseline.
-    assert all(report[key] == pytest.approx(report["baseline"][key]) for key in ERRORS)
+    assert all(report[key] == pytest.approx(report["baseline"][key], rel=1e-5) for key in ERRORS)
 
 
 def test_the_truth_itself_has_no_error(short, model_file):
@@ -392,3 +392,20 @@ def test_report_file(short, model_file, tmp_path):
     write_json(tmp_path / "deep" / "r.json", report)
     assert json.loads((tmp_path / "deep" / "r.json").read_text()) == report
     assert [file.name for file in (tmp_path / "deep").iterdir()] == ["r.json"]
+
+
+def test_the_distance_is_as_wrong_as_it_says(short, model_file):
+    """Distances wrong by one and a half sigma lie within two, not within one."""
+    done = replay(short, open_stream(model_file))
+    report = evaluate(done)
+    assert 0.1 < report["distance_sigma_median_m"] < 1
+    for frame in done.frames:
+        far = np.linalg.norm(done.truth[frame.stamp][:, 11:13].mean(1), axis=1, keepdims=True)
+        direction = done.truth[frame.stamp][:, 11:13].mean(1) / far
+        frame.lifted.root[:] = direction * (far + 1.5 * frame.lifted.distance_sigma[:, None])
+    report = evaluate(done)
+    assert (report["distance_within_1_sigma_share"], report["distance_within_2_sigma_share"]) == (0, 1)
+    assert (
+        evaluate(replay(short, open_stream(model_file), topics=Topics(camera_info="/x")))["distance_sigma_median_m"]
+        is None
+    )

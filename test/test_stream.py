@@ -13,7 +13,7 @@ from conftest import PERSON, camera_info, header_of, persons_at, seen
 
 from msg_adapters import outputs
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
+from paul_ros.model import ModelError, load_model
 from paul_ros.skeleton import Layout, LayoutError, load_layout
 from paul_ros.stream import OUTPUTS, LiftStream, open_stream
 
@@ -116,7 +116,7 @@ def test_messages_of_a_frame(stream, make, bag_make):
         assert header.frame_id == "camera_color_optical_frame"
     xyz = np.array([(p.position.x, p.position.y, p.position.z) for p in poses.poses]).reshape(2, 17, 3)
     np.testing.assert_array_equal(xyz, frame.lifted.points)
-    data = np.frombuffer(points.data, "<f4").reshape(2, 17, 6)
+    data = np.frombuffer(points.data, "<f4").reshape(2, 17, 8)
     np.testing.assert_allclose(data[..., :3], frame.lifted.points, rtol=1e-6)
     np.testing.assert_array_equal(data[..., 3], np.where(confidence > 0.3, 0.75, 0))
     np.testing.assert_array_equal(data[:, 0, 5], [5, 1])
@@ -156,7 +156,7 @@ def test_persons_that_cannot_be_lifted_are_left_out_and_counted(stream, make):
     frame = stream.keypoints(CLOUD, cloud(make, xy, ids=["1", "2", "3"]))
     messages = frame.messages(make)
     assert len(messages["poses"].poses) == 34 and messages["keypoints3d"].height == 2
-    ids = np.frombuffer(messages["keypoints3d"].data, "<f4").reshape(2, 17, 6)[:, 0, 5]
+    ids = np.frombuffer(messages["keypoints3d"].data, "<f4").reshape(2, 17, 8)[:, 0, 5]
     np.testing.assert_array_equal(ids, [1, 3])
     assert stream.drops == {"person_too_few_points": 1}
     assert stream.counts == dict(frames=1, persons=3, lifted=2)
@@ -165,7 +165,7 @@ def test_persons_that_cannot_be_lifted_are_left_out_and_counted(stream, make):
 def test_an_id_of_thousands_of_digits_is_its_row(stream, make):
     frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
     frame = replace(frame, keypoints=replace(frame.keypoints, ids=("7", "1" * 5000)))
-    ids = np.frombuffer(frame.message("keypoints3d", make).data, "<f4").reshape(2, 17, 6)[:, 0, 5]
+    ids = np.frombuffer(frame.message("keypoints3d", make).data, "<f4").reshape(2, 17, 8)[:, 0, 5]
     np.testing.assert_array_equal(ids, [7, 1])
 
 
@@ -348,3 +348,48 @@ def test_open_stream_takes_the_nodes_parameters(model_file):
     assert open_stream(str(model_file), output_layout="model").route.output.name == "coco17"
     with pytest.raises(LayoutError, match="coco17"):
         open_stream(str(model_file), output_layout="coco71")
+
+
+# --- metres
+
+
+def test_the_height_of_people_scales_the_metres_at_once(stream, make):
+    stream.camera_info(camera_info(make))
+    adults = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
+    assert stream.describe()["person_height"] == 1.7 and stream.describe()["size_spread"] == 0.06
+    stream.person_height = 0.85
+    children = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
+    np.testing.assert_allclose(children.lifted.points, 0.5 * adults.lifted.points)
+    assert stream.describe()["person_height"] == 0.85 and stream.describe()["size_spread"] == 0
+    np.testing.assert_allclose(children.bone_width, 0.5 * adults.bone_width)
+
+
+def test_a_height_that_the_model_cannot_have_is_refused(model_file):
+    model = load_model(model_file)
+    del model.header["stature"]
+    with pytest.raises(ModelError, match="does not tell the stature"):
+        Lifter(model, person_height=1.2)
+    lifter = Lifter(model)
+    assert lifter.size_spread == 0
+    with pytest.raises(ModelError):
+        lifter.person_height = 1.2
+    assert lifter.person_height == 0 and lifter.metres_per_unit == model.metres_per_unit
+
+
+def test_parameters_out_of_their_limits_are_refused(model_file):
+    with pytest.raises(ValueError, match="person_height is -1.0.*0.0 to 3.0"):
+        open_stream(str(model_file), person_height=-1.0)
+
+
+def test_ambiguity_and_distance_sigma_stand_beside_every_point(stream, make):
+    data = np.frombuffer(stream.keypoints(CLOUD, cloud(make, seen(GOOD))).message("keypoints3d", make).data, "<f4")
+    assert np.isnan(data.reshape(2, 17, 8)[..., 7]).all()
+    stream.camera_info(camera_info(make))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
+    message = frame.message("keypoints3d", make)
+    data = np.frombuffer(message.data, "<f4").reshape(2, 17, 8)
+    for column, value in ((6, frame.lifted.ambiguity), (7, frame.lifted.distance_sigma)):
+        np.testing.assert_array_equal(data[..., column], np.repeat(np.float32(value)[:, None], 17, axis=1))
+    # The shape is exact, so what is left is the spread of people's heights.
+    np.testing.assert_allclose(frame.lifted.distance_sigma, 0.06 * np.linalg.norm(frame.lifted.root, axis=1), rtol=0.05)
+    assert message.is_dense
