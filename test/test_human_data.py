@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from msg_adapters.keypoints import Intrinsics
+from paul_ros.model import load_model
 from paul_ros.placement import centred_view
 from paul_ros.skeleton import LayoutError, load_layout
 from training import human_data
@@ -20,6 +22,7 @@ from training.data import load_training_data
 from training.detector import detect, redefined, reported
 from training.human_data import other_people, see
 from training.mocap import CMU31, PARENTS, human_layout, human_mapping, human_points, layout_points
+from training.recipe import RecipeError
 from training.view_settings import COMPLETE, Views, ViewsError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -430,7 +433,9 @@ def command(*arguments):
 
 
 def test_the_command_makes_what_the_trainer_takes(archive, tmp_path):
-    done = command(archive, "-o", tmp_path / "2d.npz", "--truth", tmp_path / "3d.npz", "--set", "views=2", "--quiet")
+    done = command(
+        archive, "-o", tmp_path / "2d.npz", "--truth", tmp_path / "3d.npz", "--set", "views.views=2", "--quiet"
+    )
     assert done.returncode == 0, done.stderr
     data = load_training_data(tmp_path / "2d.npz", human_layout())
     assert data.calibrated and data.left_out == 0 and len(data.W) > 100
@@ -439,12 +444,38 @@ def test_the_command_makes_what_the_trainer_takes(archive, tmp_path):
         np.testing.assert_array_equal(two["W"], three["W"])
         assert three["S"].shape == (len(data.W), 3, 43)
         assert b'"views": 2' in two["about"].tobytes() and b"90_02" in two["about"].tobytes()
-    again = command(archive, "-o", tmp_path / "again.npz", "--set", "views=2", "--quiet")
+    again = command(archive, "-o", tmp_path / "again.npz", "--set", "views.views=2", "--quiet")
     assert again.returncode == 0 and (tmp_path / "again.npz").read_bytes() == (tmp_path / "2d.npz").read_bytes()
 
 
 def test_the_command_says_what_is_wrong(archive, tmp_path):
-    wrong = command(archive, "-o", tmp_path / "2d.npz", "--set", "levels=1")
-    assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and "unknown view setting levels" in wrong.stderr
-    empty = command(tmp_path, "-o", tmp_path / "2d.npz")
-    assert empty.returncode == 1 and empty.stderr.count("\n") == 1 and str(tmp_path) in empty.stderr
+    (tmp_path / "empty").mkdir()
+    for arguments, told in (
+        ((archive, "--set", "views.levels=1"), "unknown view setting levels"),
+        ((archive, "--set", "bottleneck.a=1"), "bottleneck has no settings of its own"),
+        ((archive, "--recipe", "default"), "--recipe human"),
+        ((tmp_path / "empty",), "holds no motion capture"),
+    ):
+        wrong = command(*arguments, "-o", tmp_path / "2d.npz")
+        assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and told in wrong.stderr, wrong.stderr
+
+
+def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, capsys):
+    """And the same command goes on with the views that it made."""
+    from training import cli
+
+    parser = argparse.ArgumentParser()
+    cli.add_arguments(parser)
+    small = ["--set", "steps=2", "--set", "batch=16", "--set", "views.views=1", "--quiet", "--recipe", "human"]
+    monkeypatch.setattr(sys, "argv", ["paul", "train"])
+    args = parser.parse_args([str(archive), "-o", str(tmp_path / "human.npz"), *small])
+    assert cli.run(args) == 0
+    model = load_model(tmp_path / "human.npz")
+    assert model.layout.name == "human" and model.min_visible == 6
+    assert model.header["training"]["recipe"]["views"] == replace(Views(), views=1).to_dict()
+    views = tmp_path / "human.run" / "views.npz"
+    made = views.stat().st_mtime_ns
+    assert cli.run(args) == 0 and views.stat().st_mtime_ns == made
+    args = parser.parse_args([str(archive), "-o", str(tmp_path / "x.npz"), "--quiet"])
+    with pytest.raises(RecipeError, match="--recipe human"):
+        cli.run(args)

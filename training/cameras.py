@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from training.mocap import human_layout
+from training.mocap import human_layout, turn
 from training.view_settings import Views
 
 WIDTH = 1280
@@ -94,21 +94,11 @@ def _orientation(ray: np.ndarray, roll: np.ndarray, sine: np.ndarray, yaw: np.nd
 
     Before the roll is undone, R ray has downward part A sin(pitch + b), with (y, z) = A (sin b, cos b).
     """
-    level = np.einsum("nji,nj->ni", _turn(roll, 2), ray)
+    level = np.einsum("nji,nj->ni", turn(roll, 2), ray)
     reach = np.hypot(level[:, 1], level[:, 2])
     pitch = np.arcsin(np.clip(sine / reach, -1, 1)) - np.arctan2(level[:, 1], level[:, 2])
     to_optical = np.diag([1.0, -1.0, -1.0])  # y up to y down, and z into the scene
-    return _turn(roll, 2) @ _turn(pitch, 0) @ to_optical @ _turn(yaw, 1)
-
-
-def _turn(angle: np.ndarray, axis: int) -> np.ndarray:
-    """Rotations (N,3,3) about a coordinate axis."""
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R = np.tile(np.eye(3), (len(angle), 1, 1))
-    R[:, i, i] = R[:, j, j] = np.cos(angle)
-    R[:, j, i] = np.sin(angle)
-    R[:, i, j] = -R[:, j, i]
-    return R
+    return turn(roll, 2) @ turn(pitch, 0) @ to_optical @ turn(yaw, 1)
 
 
 def hidden_by_body(points: np.ndarray) -> np.ndarray:

@@ -27,6 +27,8 @@ from training.data import DataError, TrainingData, check_sizes
 from training.distributed import is_first, joined
 from training.encoder_fit import fit_encoder
 from training.export import architecture, export_model
+from training.human_data import make_file, motion_files, views_of
+from training.mocap import MocapError
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.reconstruction import Run, reconstruction_of, restarts, run_folder, train_restarts
 from training.starting import START, Progress
@@ -34,13 +36,17 @@ from training.tensorboard import FOLDER as BOARD
 from training.tensorboard import Board, need_tensorboard
 from training.trainer import CHECKPOINT, LOG, Trainer, TrainingError
 
-ERRORS = (BagError, DataError, RecipeError, TrainingError, ModelError, LayoutError)
+VIEWS = "views.npz"
+"""What the run's folder keeps of a folder of motion capture."""
+
+ERRORS = (BagError, DataError, MocapError, RecipeError, TrainingError, ModelError, LayoutError)
 """What a user can cause and mend; the text of each is one clear line."""
 
 
 _EXAMPLES = """\
 examples:
   paul train recording.mcap -o hand.npz --layout hand.yaml --set bottleneck=6
+  paul train CMU_FOLDER -o human.npz --recipe human                 views of motion capture: .asf and .amc, .bvh, .npz
   paul train sequence.npz --recipe nrsfm --shapes shapes.npz        3D shapes of these very frames
   paul train views.npz -o model.npz --set restarts=4                the run of the lowest final loss is kept
   torchrun --nproc-per-node 4 --no-python paul train views.npz -o model.npz
@@ -85,8 +91,8 @@ def _add_data(parser: argparse.ArgumentParser) -> None:
         "data",
         metavar="DATA",
         nargs="+",
-        help="npz with W (F,2,P) and optional visible (F,P), or a bag of 2D keypoints; several: recordings of one "
-        "layout, or else categories of objects, each file one",
+        help="npz with W (F,2,P) and optional visible (F,P), a bag of 2D keypoints, or a folder of motion capture of "
+        "people; several files: recordings of one layout, or else categories of objects, each file one",
     )
     parser.add_argument("-o", "--output", metavar="MODEL", type=Path, help="model file to write (.npz)")
     parser.add_argument(
@@ -123,8 +129,7 @@ def run(args: argparse.Namespace) -> int:
         raise TrainingError(f"--threads must be at least 1, it is {args.threads}")
     recipe = Recipe.load(args.recipe, args.set)
     folders = _run_folders(args, recipe)
-    layout = load_layout(args.layout) if args.layout else None
-    data = load_files(args.data, layout, args.topic, args.min_confidence)
+    data, recipe = _load(args, recipe)
     data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale)))
     _check(args, recipe, data)
     torch.set_num_threads(args.threads)
@@ -137,6 +142,25 @@ def run(args: argparse.Namespace) -> int:
         if is_first():
             _write(runs, args)
     return 0
+
+
+def _load(args: argparse.Namespace, recipe: Recipe) -> tuple[TrainingData, Recipe]:
+    """The data, and the recipe, which keeps its views only where they are taken: of a folder of motion capture."""
+    layout, paths = args.layout, args.data
+    if len(paths) != 1 or not _is_motion_capture(Path(paths[0])):
+        recipe = replace(recipe, views=None)
+    else:
+        views = _folder(args) / VIEWS
+        if args.fresh:
+            views.unlink(missing_ok=True)
+        make_file(Path(paths[0]), views_of(recipe), views, quiet=args.quiet)
+        layout, paths = layout or "human", [views]
+    return load_files(paths, load_layout(layout) if layout else None, args.topic, args.min_confidence), recipe
+
+
+def _is_motion_capture(path: Path) -> bool:
+    """A folder of it, not a bag's."""
+    return path.is_dir() and not (path / "metadata.yaml").exists() and bool(motion_files(path))
 
 
 def _folder(args: argparse.Namespace) -> Path:

@@ -3,14 +3,17 @@
 
     python -m training.human_data CMU_FOLDER -o human2d.npz [--truth human3d.npz] [--set KEY=VALUE ...]
 
-CMU_FOLDER holds npz files of CMU-31 joints: ``S_world`` (F,31,3) metres, y up, with ``trial_names`` and ``trial_len``,
-or ``S_root`` with ``seq_names`` and ``seq_len`` for root-relative clips.  Only the 2D file is for the trainer; the
-3D truth of the same frames goes to another file, for evaluation.
+CMU_FOLDER holds, at any depth, what mocap.cs.cmu.edu offers: ``01_05.amc`` with ``01.asf`` beside it, or ``01_05.bvh``
+as cgspeed converted it; or npz files of CMU-31 joints: ``S_world`` (F,31,3) metres, y up, with ``trial_names`` and
+``trial_len``, or ``S_root`` with ``seq_names`` and ``seq_len`` for root-relative clips.  Only the 2D file is for the
+trainer; the 3D truth of the same frames goes to another file, for evaluation.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import hashlib
 import io
 import json
 import sys
@@ -19,34 +22,96 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from tqdm import tqdm
 
 from msg_adapters.keypoints import Intrinsics
-from paul_ros.files import write_atomically
+from paul_ros.files import NpzError, read_npz, write_atomically
 from paul_ros.model import enough_visible
 from paul_ros.placement import centred_view
+from training.asf_amc import Skeleton, read_amc, read_asf
+from training.bvh import read_bvh
 from training.cameras import Cameras, hidden_by_body, random_cameras
 from training.detector import detect, redefined, reported
-from training.mocap import CMU31, PARENTS, human_layout, human_points
-from training.view_settings import Views, ViewsError
+from training.mocap import CMU31, PARENTS, MocapError, check_size, human_layout, human_points
+from training.recipe import Recipe, RecipeError
+from training.view_settings import Views
 
 HELD_OUT = ("02", "03", "27", "29", "01_12", "01_13", "01_14", "05_17", "05_18", "05_19", "05_20")
 """Subjects and trials that no training frame comes from; those of 01 and 05 are the unseen split of the literature."""
 
 
-def read_clips(folder: Path) -> list[tuple[str, np.ndarray]]:
-    """(name, joints (F,31,3) in metres, y up) of every clip in the folder's npz files."""
-    clips = []
-    for file in sorted(folder.glob("*.npz")):
-        with np.load(file, allow_pickle=False) as archive:
-            kind = "trial" if "S_world" in archive.files else "seq"
-            joints = archive["S_world" if kind == "trial" else "S_root"]
-            ends = np.cumsum(archive[f"{kind}_len"])
-            clips += zip(archive[f"{kind}_names"].tolist(), np.split(joints, ends[:-1]))
-    if not clips:
-        raise SystemExit(f"no npz files of CMU joints in '{folder}'")
-    return clips
+def read_clips(folder: Path, progress: Callable[[float], object] = lambda share: None) -> list[tuple[str, np.ndarray]]:
+    """(name, joints (F,31,3) in metres, y up) of every clip in the folder and the folders in it.
+
+    Raises:
+        MocapError: there is none, or a file cannot be used; says what to do.
+    """
+    files = _files(folder)
+    clips: dict[str, np.ndarray] = {}
+    skeletons: dict[Path, Skeleton] = {}
+    for number, file in enumerate(files, 1):
+        for name, joints in _clips_of(file, skeletons):
+            clips[name] = joints
+        progress(number / len(files))
+    return list(clips.items())
+
+
+def motion_files(folder: Path) -> list[Path]:
+    """All files of motion capture below the folder; of trials of one name the last is taken, .npz before .amc."""
+    return [file for kind in ("bvh", "amc", "npz") for file in sorted(folder.rglob(f"*.{kind}"))]
+
+
+def _files(folder: Path) -> list[Path]:
+    """The same, where there are any; else MocapError."""
+    if files := motion_files(folder):
+        return files
+    raise MocapError(
+        f"'{folder}' holds no motion capture: neither .amc beside their .asf, nor .bvh, nor .npz of CMU joints"
+    )
+
+
+def _clips_of(file: Path, skeletons: dict[Path, Skeleton]) -> Iterator[tuple[str, np.ndarray]]:
+    """The clips of one file; skeletons: those read before, and this file's after."""
+    if file.suffix == ".npz":
+        yield from _npz_clips(file)
+    elif file.suffix == ".bvh":
+        yield file.stem, read_bvh(file)
+    else:
+        path = _skeleton_of(file)
+        if path not in skeletons:
+            skeletons[path] = read_asf(path)
+        yield file.stem, read_amc(file, skeletons[path])
+
+
+def _skeleton_of(amc: Path) -> Path:
+    """The .asf of subject 02 for 02_01.amc in its folder; else the only one there."""
+    own, there = amc.with_name(f"{amc.stem.partition('_')[0]}.asf"), sorted(amc.parent.glob("*.asf"))
+    if own not in there and len(there) != 1:
+        raise MocapError(f"{amc}: no {own.name} beside it: get the subject's skeleton as well")
+    return own if own in there else there[0]
+
+
+def _npz_clips(file: Path) -> Iterator[tuple[str, np.ndarray]]:
+    try:
+        arrays = read_npz(file, (), ("S_world", "trial_names", "trial_len", "S_root", "seq_names", "seq_len"))
+    except NpzError as error:
+        raise MocapError(f"{file}: {error}") from None
+    kind, key = ("trial", "S_world") if "S_world" in arrays else ("seq", "S_root")
+    if missing := [name for name in (key, f"{kind}_names", f"{kind}_len") if name not in arrays]:
+        raise MocapError(f"{file}: no array {missing[0]}; needed are S_world, trial_names and trial_len")
+    joints, names, lengths = arrays[key], arrays[f"{kind}_names"].tolist(), arrays[f"{kind}_len"]
+    if joints.ndim != 3 or joints.shape[1:] != (len(CMU31), 3) or joints.dtype.kind != "f":
+        raise MocapError(f"{file}: {key} must be numbers (F,{len(CMU31)},3), it is {joints.dtype} {joints.shape}")
+    if (
+        len(names) != len(lengths)
+        or lengths.dtype.kind not in "iu"
+        or (lengths < 1).any()
+        or lengths.sum() != len(joints)
+    ):
+        raise MocapError(f"{file}: {kind}_len must be the frames of each of {kind}_names, {len(joints)} together")
+    if not np.isfinite(joints).all():
+        raise MocapError(f"{file}: {key} holds NaN or infinite numbers: leave such frames out")
+    yield from zip(map(str, names), np.split(check_size(file, joints), np.cumsum(lengths)[:-1]))
 
 
 def training_clips(clips: list[tuple[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
@@ -247,46 +312,79 @@ def _blocks(frames: int, times: int) -> Iterator[slice]:
         yield from (slice(begin, begin + _BLOCK) for begin in range(0, frames, _BLOCK))
 
 
+def make_file(folder: Path, views: Views, path: Path, truth: Path | None = None, quiet: bool = False) -> None:
+    """Write the training file of a folder of motion capture, and the truth if it is named.
+
+    A file that was made from the same files with the same settings is left as it is.
+
+    Raises:
+        MocapError: the folder holds none, or a file of it cannot be used.
+    """
+    made = {"files": _digest(folder), "views": views.to_dict()}
+    if truth is None and _made_of(path) == made:
+        return
+    with _bar("motion capture", quiet) as progress:
+        clips = training_clips(read_clips(folder, progress))
+    if not clips:
+        raise MocapError(f"'{folder}' holds only trials that are kept for judging ({', '.join(HELD_OUT)})")
+    with _bar("views", quiet) as progress:
+        arrays, S = make(clips, views, progress)
+    about = {**json.loads(arrays["about"].tobytes()), **made}
+    arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    _save(path, arrays)
+    if truth:
+        _save(truth, {**arrays, "S": S})
+
+
+def _digest(folder: Path) -> str:
+    """Of the names and sizes of the files."""
+    listed = [f"{file.relative_to(folder)} {file.stat().st_size}" for file in _files(folder)]
+    return hashlib.sha256("\n".join(listed).encode()).hexdigest()
+
+
+def _made_of(path: Path) -> dict | None:
+    """Of what a file was made, if it is there and says so."""
+    try:
+        about = json.loads(read_npz(path, ("about",))["about"].tobytes())
+        return {"files": about["files"], "views": about["views"]}
+    except (NpzError, ValueError, KeyError, TypeError):
+        return None
+
+
+@contextlib.contextmanager
+def _bar(what: str, quiet: bool) -> Iterator[Callable[[float], object]]:
+    """A bar that is told the share of the work that is done."""
+    layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
+    interval = 0.1 if sys.stderr.isatty() else 30.0
+    with tqdm(total=1.0, desc=what, disable=quiet, mininterval=interval, bar_format=layout) as bar:
+        yield lambda done: bar.update(done - bar.n)
+
+
 def main() -> int:
     """The command."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.human_data",
-        description=__doc__.split("\n")[0],
-        epilog="settings and their defaults:\n"
-        + yaml.safe_dump(Views().to_dict(), default_flow_style=None, sort_keys=False),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("folder", type=Path, help="npz files of CMU-31 joints")
+    parser = argparse.ArgumentParser(prog="python -m training.human_data", description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, help="motion capture: .asf and .amc, .bvh, or npz of CMU joints")
     parser.add_argument("-o", "--output", type=Path, required=True, help="2D file for the trainer (.npz)")
     parser.add_argument("--truth", type=Path, help="3D truth of the same frames, for evaluation only (.npz)")
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="change a setting of the views")
+    parser.add_argument("--recipe", default="human", help="whose views are taken (default: %(default)s)")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="as views.distance=[1,3]")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     args = parser.parse_args()
     try:
-        views = Views.from_dict(dict(_override(text) for text in args.set))
-    except ViewsError as error:
+        make_file(args.folder, views_of(Recipe.load(args.recipe, args.set)), args.output, args.truth, args.quiet)
+        arrays = read_npz(args.output, ("visible",))
+    except (MocapError, RecipeError, OSError, NpzError) as error:
         print(f"human_data: {error}", file=sys.stderr)
         return 1
-    clips = training_clips(read_clips(args.folder))
-    with tqdm(
-        total=1.0, desc="views", disable=args.quiet, bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}"
-    ) as bar:
-        arrays, truth = make(clips, views, lambda done: bar.update(done - bar.n))
-    _save(args.output, arrays)
-    if args.truth:
-        _save(args.truth, {**arrays, "S": truth})
-    print(f"{args.output}: {len(truth)} frames, {1 - arrays['visible'].mean():.0%} of the points hidden")
+    print(f"{args.output}: {len(arrays['visible'])} frames, {1 - arrays['visible'].mean():.0%} of the points hidden")
     return 0
 
 
-def _override(text: str) -> tuple[str, object]:
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise ViewsError(f"'{text}' is no setting: write key=value")
-    try:
-        return key.strip(), yaml.safe_load(value)
-    except yaml.YAMLError:
-        raise ViewsError(f"the value in '{text}' is no YAML") from None
+def views_of(recipe: Recipe) -> Views:
+    """The recipe's views; raises RecipeError where it has none."""
+    if recipe.views is None:
+        raise RecipeError("a folder of motion capture needs a recipe that says how people are seen: --recipe human")
+    return recipe.views
 
 
 def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:

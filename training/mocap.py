@@ -17,6 +17,7 @@ frames built from the bones, by the offsets that stand below with their sources.
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -91,6 +92,50 @@ PARENTS = (
     27,
 )
 """Index of the joint at which each bone begins; -1 for the root."""
+
+_MAX_BYTES = 500_000_000
+_THIGH = (0.15, 0.8)  # metres, of anybody
+
+
+class MocapError(ValueError):
+    """Motion capture that cannot be used; the text names the file, the line if there is one, and what is wrong."""
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a text file; raises MocapError."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise MocapError(f"{path}: more than {_MAX_BYTES // 10**6} MB: this is no motion capture")
+        return path.read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError as error:
+        raise MocapError(f"{path}: {error.strerror or error}") from None
+
+
+def rotation(angles: np.ndarray, order: tuple[int, ...]) -> np.ndarray:
+    """Rotations (N,3,3) by angles (N,3) about the fixed axes x, y, z, in radians: about those of ``order``, in turn."""
+    turned = np.tile(np.eye(3), (len(angles), 1, 1))
+    for axis in order:
+        turned = turn(angles[:, axis], axis) @ turned
+    return turned
+
+
+def turn(angle: np.ndarray, axis: int) -> np.ndarray:
+    """Rotations (N,3,3) by angles (N,), in radians, about one axis of 0, 1, 2 for x, y, z."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R = np.tile(np.eye(3), (len(angle), 1, 1))
+    R[:, i, i] = R[:, j, j] = np.cos(angle)
+    R[:, j, i] = np.sin(angle)
+    R[:, i, j] = -R[:, j, i]
+    return R
+
+
+def check_size(path: Path, joints: np.ndarray) -> np.ndarray:
+    """The joints (F,31,3), if their thighs are those of a person in metres; raises MocapError."""
+    thigh = float(np.linalg.norm(_joint(joints, "lfemur") - _joint(joints, "lhipjoint"), axis=1)[0])
+    if not _THIGH[0] < thigh < _THIGH[1]:
+        raise MocapError(f"{path}: a thigh is {thigh:.3g} m long: the file's unit is not that of the CMU archive")
+    return joints
+
 
 # The head is the same for everybody: averages of adults, metres in the head frame (lateral to the left, up, forward)
 # from the ear level.  Eyes and mouth: Farkas, Anthropometry of the Head and Face, 1994 (between the inner corners of

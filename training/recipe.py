@@ -12,6 +12,7 @@ from pathlib import Path
 import yaml
 
 from paul_ros.skeleton import Layout
+from training.view_settings import Views, ViewsError
 
 
 class RecipeError(ValueError):
@@ -82,10 +83,11 @@ class Recipe:
     mirror_object: bool = False  # left and right exchanged: only for objects that are symmetric
     hide: float = 0.0  # up to this share of a frame's points is hidden anew at every step
     known_lengths: tuple[tuple[str, str, float], ...] = ()  # (point, point, metres): sets the metres per model unit
+    views: Views | None = None  # how people are seen, where the data is a folder of motion capture (view_settings.py)
 
     @classmethod
     def load(cls, name_or_path: str | Path, overrides: list[str] = ()) -> Recipe:
-        """Read a shipped recipe by name or any YAML file, then apply ``key=value`` overrides.
+        """Read a shipped recipe by name or any YAML file, then apply ``key=value`` or ``views.key=value`` overrides.
 
         A file may name a shipped recipe as its ``base``, whose settings it then changes.
 
@@ -97,7 +99,9 @@ class Recipe:
             key, equals, value = override.partition("=")
             if not equals:
                 raise RecipeError(f"'{override}' is no override: write key=value")
-            settings[key.strip()] = _parsed(value, f"the value in '{override}'")
+            key, _, part = key.strip().partition(".")
+            value = _parsed(value, f"the value in '{override}'")
+            settings[key] = {**_mapping(settings.get(key), key), part: value} if part else value
         return cls.from_dict(settings)
 
     @classmethod
@@ -154,13 +158,15 @@ class Recipe:
                 )
 
     def to_dict(self) -> dict:
-        """Plain lists and numbers, for YAML and the model's header."""
-        return {
+        """Plain lists and numbers, for YAML and the model's header; without views where there are none."""
+        plain = {
             key: [list(item) if isinstance(item, tuple) else item for item in value]
             if isinstance(value, tuple)
             else value
-            for key, value in dataclasses.asdict(self).items()
+            for key, value in vars(self).items()
+            if key != "views"
         }
+        return {**plain, "views": self.views.to_dict()} if self.views else plain
 
 
 def recipe_names() -> list[str]:
@@ -192,8 +198,19 @@ def _parsed(text: str | bytes, what: str) -> object:
         raise RecipeError(f"{what} is no YAML: {' '.join(str(error).split())[:200]}") from None
 
 
+def _mapping(value: object, key: str) -> dict:
+    if value is not None and not isinstance(value, dict):
+        raise RecipeError(f"recipe setting {key} has no settings of its own")
+    return value or {}
+
+
 def _converted(key: str, value: object, default: object) -> object:
     """The value in the default's type; lists become tuples."""
+    if key == "views":
+        try:
+            return value if value is None or isinstance(value, Views) else Views.from_dict(value)
+        except ViewsError as error:
+            raise RecipeError(str(error)) from None
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
         return tuple(tuple(item) if isinstance(item, list) else item for item in value)
     if isinstance(default, bool) and isinstance(value, bool):
