@@ -117,8 +117,13 @@ def _npz_clips(file: Path) -> Iterator[tuple[str, np.ndarray]]:
 def training_clips(clips: list[tuple[str, np.ndarray]]) -> list[tuple[str, np.ndarray]]:
     """The clips that are neither held out nor copies of held-out ones under another name."""
     held_out = [joints for name, joints in clips if name.startswith(HELD_OUT)]
-    known = np.concatenate([_limb_angles(joints) for joints in held_out] or [np.full((1, 28), np.inf)])
-    return [(name, joints) for name, joints in clips if not name.startswith(HELD_OUT) and not _is_copy(joints, known)]
+    others = [(name, joints) for name, joints in clips if not name.startswith(HELD_OUT)]
+    if not held_out:
+        return others
+    known = np.concatenate([_limb_angles(joints) for joints in held_out])
+    key = int(known.std(0).argmax())
+    known = known[known[:, key].argsort()]
+    return [(name, joints) for name, joints in others if not _is_copy(joints, known, key)]
 
 
 _LIMBS = {"femur": "hipjoint", "tibia": "femur", "humerus": "clavicle", "radius": "humerus"}
@@ -145,11 +150,17 @@ def _limb_angles(joints: np.ndarray) -> np.ndarray:
     return (limbs @ limbs.transpose(0, 2, 1))[:, upper[0], upper[1]]
 
 
-def _is_copy(joints: np.ndarray, known: np.ndarray) -> bool:
-    """Most of some sampled poses occur among the known ones, to rounding."""
-    sample = _limb_angles(joints[:: max(1, len(joints) // 12)])
-    nearest = np.array([np.abs(known - pose).max(1).min() for pose in sample])
-    return float(np.median(nearest)) < 0.02
+_SAME = 0.02
+"""Poses whose limbs' cosines differ by less are one, to rounding."""
+
+
+def _is_copy(joints: np.ndarray, known: np.ndarray, key: int) -> bool:
+    """Most of some sampled poses occur among the known ones (N,28), which are sorted by the angle ``key``."""
+    found = []
+    for pose in _limb_angles(joints[:: max(1, len(joints) // 12)]):
+        begin, end = np.searchsorted(known[:, key], [pose[key] - _SAME, pose[key] + _SAME])
+        found.append((np.abs(known[begin:end] - pose).max(1) < _SAME).any())
+    return float(np.mean(found)) > 0.5
 
 
 def distinct_frames(joints: np.ndarray, motion: float) -> np.ndarray:
