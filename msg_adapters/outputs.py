@@ -33,6 +33,15 @@ def pose_array(make, header, points: np.ndarray):
     return make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
 
 
+def body_array(make, header, positions: np.ndarray, quaternions: np.ndarray):
+    """geometry_msgs/PoseArray, one pose a person: positions (N, 3), quaternions (N, 4) as x, y, z, w."""
+    poses = [
+        make("geometry_msgs/msg/Pose", position=_point(make, xyz), orientation=_quaternion(make, *xyzw))
+        for xyz, xyzw in zip(positions.tolist(), quaternions.tolist())
+    ]
+    return make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
+
+
 def keypoints_cloud(make, header, xy: np.ndarray, confidence: np.ndarray, person_ids):
     """2D keypoints as the native contract: an organised cloud, height = persons, width = keypoints.
 
@@ -187,5 +196,5 @@ def _point(make, xyz):
     return make("geometry_msgs/msg/Point", x=xyz[0], y=xyz[1], z=xyz[2])
 
 
-def _quaternion(make):
-    return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
+def _quaternion(make, x: float = 0.0, y: float = 0.0, z: float = 0.0, w: float = 1.0):
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

@@ -37,6 +37,7 @@ _RECORDED = {
     **_PLAYED,
     f"{NODE}/layout": "std_msgs/msg/String",
     f"{NODE}/poses": POSE_ARRAY,
+    f"{NODE}/bodies": POSE_ARRAY,
     f"{NODE}/keypoints3d": _CLOUD,
     f"{NODE}/markers": "visualization_msgs/msg/MarkerArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",

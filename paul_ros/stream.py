@@ -18,6 +18,7 @@ import numpy as np
 
 import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, outputs
+from paul_ros.bodies import Steady, body_rotations, quaternions
 from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
 from paul_ros.model import load_model
 from paul_ros.parameters import checked
@@ -43,14 +44,15 @@ class Frame:
     """One lifted message.
 
     header: the input's own header; keypoints: its N persons, hidden what was not used; lifted: their 3D, both in the
-    layout of the output; given: the keypoints in the model's layout, low confidences hidden; bone_width in the units of
-    the points.
+    layout of the output; attitudes: (N,4) quaternions of the body axes; given: the keypoints in the model's layout, low
+    confidences hidden; bone_width in the units of the points.
     """
 
     header: object
     keypoints: Keypoints2D
     lifted: Lifted
     layout: Layout
+    attitudes: np.ndarray
     given: Keypoints2D
     bone_width: float
 
@@ -64,6 +66,9 @@ class Frame:
 
     def _poses(self, make, ok: np.ndarray):
         return outputs.pose_array(make, self.header, self.lifted.points[ok])
+
+    def _bodies(self, make, ok: np.ndarray):
+        return outputs.body_array(make, self.header, self.lifted.root[ok], self.attitudes[ok])
 
     def _keypoints3d(self, make, ok: np.ndarray):
         # An id that is no number becomes its row of the input, so rows are numbered before any is left out.
@@ -93,6 +98,7 @@ class Frame:
 #: Output name -> type name of its message.
 OUTPUTS = {
     "poses": "geometry_msgs/msg/PoseArray",
+    "bodies": "geometry_msgs/msg/PoseArray",
     "keypoints3d": "sensor_msgs/msg/PointCloud2",
     "markers": "visualization_msgs/msg/MarkerArray",
 }
@@ -155,6 +161,7 @@ class LiftStream:
         self._last_stamp: int | None = None
         self._image_size: tuple[int, int] | None = None
         self._gathered = _Gathered()
+        self._steady = Steady()
 
     @property
     def route(self) -> Route:
@@ -292,7 +299,16 @@ class LiftStream:
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
         visible = np.where(lifted.ok[:, None], lifted.used, given.visible)
         used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))
-        return Frame(header, route.keypoints_out(used), route.lifted_out(lifted), route.output, given, width)
+        axes = body_rotations(lifted.points, lifted.rotation, model.layout)
+        return Frame(
+            header,
+            route.keypoints_out(used),
+            route.lifted_out(lifted),
+            route.output,
+            self._steady(given.ids, quaternions(axes)),
+            given,
+            width,
+        )
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:
         start = time.perf_counter_ns()

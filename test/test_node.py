@@ -40,18 +40,14 @@ class Bench:
 
         self.ros, self.lifter, self.stamp = ros, lifter, 100_000
         self.node = ros.create_node("bench", namespace=lifter.namespace)
-        self.got = {name: [] for name in ("poses", "keypoints3d", "markers", "layout", "diagnostics")}
+        self.got = {name: [] for name in (*OUTPUTS, "layout", "diagnostics")}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         self.keypoints = self.node.create_publisher(
             class_of(kind), "keypoints", QoSProfile(depth=10, reliability=reliability)
         )
         self.camera = self.node.create_publisher(class_of("sensor_msgs/msg/CameraInfo"), "camera_info", 10)
-        for name, type_name in (
-            ("poses", "geometry_msgs/msg/PoseArray"),
-            ("keypoints3d", "sensor_msgs/msg/PointCloud2"),
-            ("markers", "visualization_msgs/msg/MarkerArray"),
-        ):
+        for name, type_name in OUTPUTS.items():
             self.node.create_subscription(class_of(type_name), f"lifter/{name}", self.got[name].append, 10)
         self.node.create_subscription(String, "lifter/layout", self.got["layout"].append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
@@ -82,7 +78,7 @@ class Bench:
 
         def answered():
             self.send(nobody())
-            return all(self.got[name] for name in ("poses", "keypoints3d", "markers", "layout"))
+            return all(self.got[name] for name in (*OUTPUTS, "layout"))
 
         self.until(answered, "answers on all outputs")
 
@@ -235,7 +231,7 @@ def test_header_is_the_inputs_in_every_output(bench):
         return good()(header)
 
     bench.send(fill)
-    for name in ("poses", "keypoints3d", "markers"):
+    for name in OUTPUTS:
         header = header_in(bench.answer(name, 2_000_000_123))
         assert (header.stamp.nanosec, header.frame_id) == (999_999_999, "left eye/optical")
 
@@ -253,7 +249,7 @@ def test_outputs_agree_with_each_other(bench):
 
 def test_zero_persons_are_answered_by_empty_outputs(bench):
     seconds = bench.send(nobody())
-    assert len(bench.answer("poses", seconds).poses) == 0
+    assert len(bench.answer("poses", seconds).poses) == len(bench.answer("bodies", seconds).poses) == 0
     assert bench.answer("keypoints3d", seconds).height == 0
     assert bench.answer("markers", seconds).markers[0].action == 2
 
@@ -534,12 +530,12 @@ def test_a_fault_in_building_leaves_no_half_frame(ros, lifter_node):
     with pytest.raises(ZeroDivisionError):
         lifter_node._publish(FrameThatCounts(faulty="markers"))
     lifter_node._publish(FrameThatCounts())
-    while len(got) < 3 and time.monotonic() < end:
+    while len(got) < len(OUTPUTS) and time.monotonic() < end:
         ros.spin_once(listener, timeout_sec=0.02)
-    # What was published first comes first on each topic: had the faulty frame gone out in part, a fourth would come.
+    # What was published first comes first on each topic: had the faulty frame gone out in part, one more would come.
     for _ in range(10):
         ros.spin_once(listener, timeout_sec=0.02)
-    assert len(got) == 3
+    assert len(got) == len(OUTPUTS)
     listener.destroy_node()
 
 

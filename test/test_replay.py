@@ -82,6 +82,7 @@ def test_lifted_bag_holds_inputs_and_outputs(short, model_file, tmp_path):
         "/ground_truth/poses": 90,
         "/lifter/layout": 2,
         "/lifter/poses": 90,
+        "/lifter/bodies": 90,
         "/lifter/keypoints3d": 90,
         "/lifter/markers": 90,
     }

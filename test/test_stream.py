@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import PERSON, camera_info, header_of, persons_at, seen
+from scipy.spatial.transform import Rotation
 
 from msg_adapters import outputs
 from paul_ros.lifter import Lifter
@@ -393,3 +394,17 @@ def test_ambiguity_and_distance_sigma_stand_beside_every_point(stream, make):
     # The shape is exact, so what is left is the spread of people's heights.
     np.testing.assert_allclose(frame.lifted.distance_sigma, 0.06 * np.linalg.norm(frame.lifted.root, axis=1), rtol=0.05)
     assert message.is_dense
+
+
+def test_one_pose_a_person_in_bodies(stream, make):
+    """PERSON looks at the camera: x to the camera, y to the right of the image, z up."""
+    stream.camera_info(camera_info(make))
+    xy = seen(persons_at((0.3, 0, 4), (1, 0, 4), (-1, 0.1, 5)))
+    xy[1, 2:] = np.nan
+    bodies = stream.keypoints(CLOUD, cloud(make, xy)).message("bodies", make).poses
+    assert len(bodies) == 2
+    for pose, where in zip(bodies, ((0.3, 0.1, 4), (-1, 0.2, 5))):
+        p, q = pose.position, pose.orientation
+        np.testing.assert_allclose((p.x, p.y, p.z), where, atol=0.03)
+        axes = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix().T
+        np.testing.assert_allclose(axes, [(0, 0, -1), (1, 0, 0), (0, -1, 0)], atol=0.06)
