@@ -52,6 +52,7 @@ LEAST_POINTS = 4
 CAMERA_INFO, POSE_ARRAY = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseArray"
 _OPTIONS = {"keypoints": "--topic", "camera info": "--camera-info-topic", "ground truth": "--ground-truth-topic"}
 _MM = 1000.0
+_FLIP = 0.3  # of a person's size
 _FARTHEST = 1e9  # metres; what is farther off, or no number, is no truth
 _LEAST_SIZE = 1e-6  # metres; all points in one place are no truth either
 
@@ -258,6 +259,7 @@ def evaluate(done: Replay) -> dict:
         "lift_us_median": _number(np.median(times)),
         "lift_us_p99": _number(np.percentile(times, 99)),
         **_doubt(done),
+        **flips(done.frames),
         "baseline": errors(with_truth(done, rigid_frames(done)), done.layout.root),
         "model": model.name,
         "model_sha256": model.sha256,
@@ -283,6 +285,43 @@ def _doubt(done: Replay) -> dict:
         "distance_within_1_sigma_share": _mean([share <= 1 for share in shares]),
         "distance_within_2_sigma_share": _mean([share <= 2 for share in shares]),
     }
+
+
+def flips(frames: list[LiftedFrame]) -> dict:
+    """How often a person's depth turns over from one frame to the next.
+
+    Of persons with an id that were lifted in two frames one after the other: a flip is where the person, about its mean
+    point, is nearer to its mirror image of the frame before, mirrored across the plane that faces the camera, than to
+    itself, has moved by more than _FLIP of its own size, and has moved by less than that in the image. So it covers
+    both a body that turns front to back and one that takes its mirror image: the 2D tells neither.
+    """
+    pairs = turned = 0
+    before: dict[str, tuple] = {}
+    for frame in frames:
+        now = {name: (frame, row) for row, name in enumerate(frame.keypoints.ids) if name and frame.lifted.ok[row]}
+        both = [(before[name], now[name]) for name in now if name in before]
+        pairs += len(both)
+        turned += sum(_flipped(*pair) for pair in both)
+        before = now
+    return {"pairs_of_frames": pairs, "flips_per_1000_frames": 1000 * turned / pairs if pairs else None}
+
+
+def _flipped(before: tuple[LiftedFrame, int], now: tuple[LiftedFrame, int]) -> bool:
+    old, new = (_about_mean(frame.lifted.points[row]) for frame, row in (before, now))
+    frame, row = before
+    # In model units the root is the origin, and the camera looks along z.
+    ray = frame.lifted.root[row] if frame.lifted.units == "m" else np.array([0.0, 0.0, 1.0])
+    ray = ray / _length(ray)
+    mirrored = old - 2 * (old @ ray)[:, None] * ray
+    both = before[0].given.visible[before[1]] & now[0].given.visible[now[1]]
+    images = [_about_mean(frame.given.xy[row][both]) for frame, row in (before, now)]
+    still = np.linalg.norm(images[1] - images[0]) < _FLIP * np.linalg.norm(images[0])
+    moved = np.linalg.norm(new - old)
+    return bool(still and np.linalg.norm(new - mirrored) < moved and moved > _FLIP * np.linalg.norm(old))
+
+
+def _about_mean(points: np.ndarray) -> np.ndarray:
+    return points - points.mean(0)
 
 
 def _length(vectors: np.ndarray) -> np.ndarray:

@@ -57,6 +57,7 @@ def table(report: dict) -> str:
         f"  {'reprojection, median':<22}{_cell(report['reprojection_median_px'])}{'':>9}  px",
         f"  {'proven optimal':<22}{_cell(report['certified_share'], 100)}{'':>9}  %",
         f"  {'mirror ambiguous':<22}{_cell(report['ambiguous_share'], 100)}{'':>9}  %",
+        f"  {'flips in depth':<22}{_cell(report['flips_per_1000_frames'])}{'':>9}  of 1000 frames to the next",
         f"  {'lift, median':<22}{_cell(report['lift_us_median'])}{'':>9}  µs a frame "
         f"(99 %: {_cell(report['lift_us_p99']).strip()})",
     ]

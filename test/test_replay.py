@@ -12,7 +12,7 @@ import pytest
 
 from paul_ros import metrics
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
-from paul_ros.replay import Topics, evaluate, replay
+from paul_ros.replay import Topics, evaluate, flips, replay
 from paul_ros.report import PictureError, table, write_json, write_picture
 from paul_ros.route import map_points
 from paul_ros.skeleton import load_layout
@@ -410,3 +410,26 @@ def test_the_distance_is_as_wrong_as_it_says(short, model_file):
         evaluate(replay(short, open_stream(model_file), topics=Topics(camera_info="/x")))["distance_sigma_median_m"]
         is None
     )
+
+
+def test_flips_are_counted(model_file):
+    """Persons mirrored in depth, or turned about, in single frames; not those that move in the image as well."""
+    done = replay(TWO, open_stream(model_file))
+    clean = flips(done.frames)
+    for frame in done.frames[100:200:10]:
+        ray = frame.lifted.root / np.linalg.norm(frame.lifted.root, axis=1, keepdims=True)
+        depth = ((frame.lifted.points - frame.lifted.root[:, None]) * ray[:, None]).sum(2, keepdims=True)
+        frame.lifted.points[:] -= 2 * depth * ray[:, None]
+    lifted = sum(frame.lifted.ok.sum() for frame in done.frames[100:200:10])
+    counted = flips(done.frames)
+    assert counted["pairs_of_frames"] == clean["pairs_of_frames"] > 500
+    new = (counted["flips_per_1000_frames"] - clean["flips_per_1000_frames"]) * counted["pairs_of_frames"] / 1000
+    # There and back, but for persons that are about flat to the camera: their mirror image is hardly another.
+    assert lifted < new <= 2 * lifted
+
+
+def test_who_has_no_id_has_no_flips(short, model_file):
+    done = replay(short, open_stream(model_file))
+    for frame in done.frames:
+        object.__setattr__(frame.keypoints, "ids", ("",) * len(frame.keypoints.ids))
+    assert flips(done.frames) == {"pairs_of_frames": 0, "flips_per_1000_frames": None}
