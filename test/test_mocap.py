@@ -174,6 +174,8 @@ AMC_FAULTS = {
     "not a number": (3, "head", "head 1 nan 3", r":\d+: 'head' must have 3 numbers"),
     "a line lost": (3, "head", None, r":\d+: 'lfemur' where 'head' of frame 3 belongs"),
     "another order": (2, "head", "thorax 1 2 3", r":\d+: 'thorax' where 'head' of frame 2 belongs"),
+    "an empty line": (1, "head", "", r":\d+: an empty line within a frame"),
+    "a number that is too large": (2, "head", "head 1 1e300 3", r":\d+: 'head' must have 3 numbers"),
     "no number of a frame": (3, "3", "3x", r":\d+: '3x' where its number of frame 3 belongs"),
 }
 
@@ -314,6 +316,7 @@ def test_the_bones_that_the_conversion_leaves_out_are_put_back(tmp_path):
 BVH_FAULTS = {
     "HIERARCHY": ("HIERARCHIE", ":1: no HIERARCHY"),
     "JOINT LeftFoot": ("JOINT LeftFeet", "no joint 'LeftFoot'"),
+    "JOINT RightShoulder": ("JOINT Shoulder", "no joint 'RightShoulder'"),
     "JOINT RightFoot": ("JOINT LeftFoot", r":\d+: joint 'LeftFoot' is there twice"),
     "CHANNELS 3 Zrotation": ("CHANNELS 4 Zrotation", r":\d+: CHANNELS must be their number"),
     "Frames: 3": ("Frames: 4", "3 of 4 frames are there"),

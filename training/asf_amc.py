@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from training.mocap import CMU31, MocapError, check_size, read_lines, rotation
+from training.mocap import CMU31, MocapError, are_numbers, check_size, read_lines, rotation
 
 INCH = 0.0254
 """Metres: CMU's lengths, divided by the skeleton's unit of length, are inches (mocap.cs.cmu.edu, Frequently Asked)."""
@@ -135,7 +135,7 @@ class _AsfReader:
             numbers = np.array([float(word) for word in words])
         except ValueError:
             numbers = np.array([])
-        if len(numbers) != count or not np.isfinite(numbers).all():
+        if len(numbers) != count or not are_numbers(numbers):
             raise self._wrong(f"{what} must be {count} numbers, it is '{' '.join(words)[:40]}'")
         return numbers
 
@@ -222,8 +222,10 @@ def _read_values(path: Path, skeleton: Skeleton) -> dict[str, np.ndarray]:
     lines, first = _frames(path)
     end = next((k for k, text in enumerate(lines[1:], 1) if text.strip().isdecimal()), len(lines))
     moving = {"root": 6, **{bone.name: len(bone.dof) for bone in skeleton.bones if bone.dof}}
-    names = [text.split()[0] for text in lines[1:end]]
+    names = [" ".join(text.split()[:1]) for text in lines[1:end]]
     for number, name in enumerate(names, first + 1):
+        if not name:
+            raise MocapError(f"{path}:{number}: an empty line within a frame")
         if name not in moving:
             raise MocapError(f"{path}:{number}: '{name[:40]}' does not move in {skeleton.path.name}: another skeleton?")
     if missing := [name for name in moving if names.count(name) != 1]:
@@ -262,7 +264,7 @@ def _column(lines: list[str], name: str, count: int) -> np.ndarray:
     if any(len(line) != count + 1 or line[0] != name for line in words):
         raise ValueError(name)
     values = np.array([line[1:] for line in words], dtype=float)
-    if not np.isfinite(values).all():
+    if not are_numbers(values):
         raise ValueError(name)
     return values
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from training.asf_amc import INCH
-from training.mocap import CMU31, MocapError, check_size, read_lines, rotation
+from training.mocap import CMU31, MocapError, are_numbers, check_size, read_lines, rotation
 
 METRES = INCH / 0.45
 """Of a unit of length."""
@@ -53,6 +53,8 @@ for _letter, _side in (("l", "Left"), ("r", "Right")):
         f"{_letter}fingers": f"{_side}HandIndex1{_END}",
         f"{_letter}thumb": f"{_letter.upper()}Thumb{_END}",
     }
+_ON_THE_LEFT_OUT = ("LeftShoulder", "RightShoulder", "LThumb", "RThumb")
+"""Joints that hang on a bone that the conversion leaves out, and are no ends of bones themselves."""
 
 
 @dataclass
@@ -74,7 +76,7 @@ def read_bvh(path: Path) -> np.ndarray:
     reader = _BvhReader(path)
     joints, values = reader.hierarchy(), reader.motion()
     index = {joint.name: k for k, joint in enumerate(joints)}
-    if missing := [name for name in _JOINTS.values() if name not in index]:
+    if missing := [name for name in (*_JOINTS.values(), *_ON_THE_LEFT_OUT) if name not in index]:
         raise MocapError(
             f"{path}: no joint '{missing[0].strip()}', this is none of cgspeed's conversions of the archive"
         )
@@ -185,7 +187,7 @@ class _BvhReader:
             numbers = np.array([float(word) for word in words])
         except ValueError:
             numbers = np.array([])
-        if len(numbers) != count or not np.isfinite(numbers).all():
+        if len(numbers) != count or not are_numbers(numbers):
             raise self._wrong(f"{what} must be {count} numbers, it is '{' '.join(words)[:40]}'")
         return numbers
 
@@ -203,7 +205,7 @@ class _BvhReader:
             raise self._wrong(f"{len(rows)} of {frames} frames are there: the file is damaged, get it again")
         try:
             values = np.array([text.split() for _, text in rows], dtype=float)
-            sound = values.shape == (frames, self.channels) and np.isfinite(values).all()
+            sound = values.shape == (frames, self.channels) and are_numbers(values)
         except ValueError:
             sound = False
         if not sound:

@@ -94,6 +94,7 @@ PARENTS = (
 """Index of the joint at which each bone begins; -1 for the root."""
 
 _MAX_BYTES = 500_000_000
+_MAX_NUMBER = 1e6
 _THIGH = (0.15, 0.8)  # metres, of anybody
 
 
@@ -109,6 +110,11 @@ def read_lines(path: Path) -> list[str]:
         return path.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError as error:
         raise MocapError(f"{path}: {error.strerror or error}") from None
+
+
+def are_numbers(values: np.ndarray) -> bool:
+    """Whether all are numbers that a length or an angle can have."""
+    return bool((np.abs(values) < _MAX_NUMBER).all())
 
 
 def rotation(angles: np.ndarray, order: tuple[int, ...]) -> np.ndarray:
