@@ -57,7 +57,7 @@ class Views:
     layouts: tuple[tuple[str, float], ...] = (  # whose points it reports, and its share of the views
         ("coco17", 0.3),
         ("body25", 0.15),
-        ("openpose18", 0.1),
+        ("openpose18", 0.1),  # and hri18, of the same points
         ("h36m17", 0.15),
         ("mediapipe33", 0.15),
         (COMPLETE, 0.15),
