@@ -66,6 +66,9 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
         "--person-height", type=float, metavar="METRES", help="of the people in the bag (default: the model's adults)"
     )
     parser.add_argument(
+        "--smoothing", type=float, metavar="HZ", help="as the node's parameter: a filter over time (default: off)"
+    )
+    parser.add_argument(
         "--topic",
         default="/keypoints",
         help="2D keypoints (default: %(default)s); * is any part of a name, as in '/humans/bodies/*/skeleton2d'",

@@ -47,6 +47,14 @@ PARAMETERS = (
         (0.0, 3.0),
         live=True,
     ),
+    Parameter(
+        "smoothing",
+        0.0,
+        "Hz, cut-off of a filter over time for persons at rest (one-euro, not part of PAUL; it needs person ids): the "
+        "lower the smoother, 1.0 is a good start; 0 = off, every frame for itself.",
+        (0.0, 100.0),
+        live=True,
+    ),
     Parameter("min_confidence", 0.3, "Keypoints with a lower confidence count as hidden.", (0.0, 1.0), live=True),
     Parameter(
         "max_persons", 64, "Messages with more persons are dropped, counted as too_many_persons.", (1, 10000), live=True

@@ -24,6 +24,7 @@ from paul_ros.model import load_model
 from paul_ros.parameters import checked
 from paul_ros.route import MODEL, Route, read_unknown
 from paul_ros.skeleton import Layout, layout_names, load_layout
+from paul_ros.smoothing import OneEuro
 
 #: Lift times kept for the median and the 99th percentile: the last half minute at 30 Hz.
 _TIMES_KEPT = 1000
@@ -119,11 +120,12 @@ def open_stream(model: str | None = None, layout: str | None = None, **parameter
         values["min_confidence"],
         values["max_persons"],
         loaded.layout if output == MODEL else load_layout(output) if output else None,
+        values["smoothing"],
     )
 
 
 class LiftStream:
-    """Lifts a stream of 2D keypoint messages, one image at a time and each for itself.
+    """Lifts a stream of 2D keypoint messages, one image at a time and, unless `smoothing` is set, each for itself.
 
     Of most types a message is an image. Where it is one person, those of one stamp are lifted together as soon as a
     message of another stamp tells that they are all, or flush() does.
@@ -140,8 +142,11 @@ class LiftStream:
         min_confidence: float,
         max_persons: int,
         output_layout: Layout | None = None,
+        smoothing: float = 0.0,
     ) -> None:
         """layout: of the messages, None = found from the first that shows somebody; output_layout: see Route.between.
+
+        smoothing: see OneEuro.
 
         Raises LayoutError where these cannot be had from each other.
         """
@@ -162,6 +167,7 @@ class LiftStream:
         self._image_size: tuple[int, int] | None = None
         self._gathered = _Gathered()
         self._steady = Steady()
+        self._filter = OneEuro(smoothing)
 
     @property
     def route(self) -> Route:
@@ -176,6 +182,15 @@ class LiftStream:
     @person_height.setter
     def person_height(self, height: float) -> None:
         self.lifter.person_height = height
+
+    @property
+    def smoothing(self) -> float:
+        """Cut-off of the filter over time in Hz, 0 = off."""
+        return self._filter.cutoff
+
+    @smoothing.setter
+    def smoothing(self, cutoff: float) -> None:
+        self._filter.cutoff = cutoff
 
     @property
     def units(self) -> str:
@@ -256,6 +271,7 @@ class LiftStream:
             "scale_source": _scale_source(self.intrinsics, model.metres_per_unit),
             "person_height": self.person_height or model.stature,
             "size_spread": self.lifter.size_spread,
+            "smoothing_hz": self.smoothing,
             "chirality": model.header.get("chirality"),
             "model": model.name,
             "model_sha256": model.sha256,
@@ -286,7 +302,7 @@ class LiftStream:
             )
 
     def _frame(self, header, given: Keypoints2D) -> Frame:
-        # Every frame is lifted for itself, so time may run backwards, as when a bag loops; it is only noted.
+        # Time may run backwards, as when a bag loops; it is only noted.
         if self._last_stamp is not None and given.stamp < self._last_stamp:
             self.notes["stamp_backwards"] += 1
         self._last_stamp = given.stamp
@@ -295,6 +311,7 @@ class LiftStream:
         for reason in filter(None, lifted.reason):
             self._drop("person_" + reason, f"{_LEFT_OUT[reason]}; this person is left out of the outputs")
         model, route = self.lifter.model, self.route
+        lifted = self._filter(given.ids, given.stamp, lifted, model.layout.root)
         unit = self.lifter.metres_per_unit if lifted.units == "m" else 1.0
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
         visible = np.where(lifted.ok[:, None], lifted.used, given.visible)

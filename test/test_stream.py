@@ -408,3 +408,23 @@ def test_one_pose_a_person_in_bodies(stream, make):
         np.testing.assert_allclose((p.x, p.y, p.z), where, atol=0.03)
         axes = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix().T
         np.testing.assert_allclose(axes, [(0, 0, -1), (1, 0, 0), (0, -1, 0)], atol=0.06)
+
+
+def test_smoothing_is_off_until_it_is_set(stream, make):
+    def answers(cutoff):
+        stream.smoothing = cutoff
+        frames = []
+        for nanoseconds in range(0, 10**9, 10**8):
+            xy = seen(GOOD) + np.random.default_rng(nanoseconds).normal(0, 3, (2, 17, 2))
+            frames.append(stream.keypoints(CLOUD, cloud(make, xy, nanoseconds=nanoseconds)))
+        return np.array([frame.lifted.points for frame in frames]), frames
+
+    stream.camera_info(camera_info(make))
+    assert stream.smoothing == stream.describe()["smoothing_hz"] == 0
+    raw, _ = answers(0.0)
+    smooth, frames = answers(0.5)
+    assert np.diff(smooth, 2, axis=0).std() < 0.6 * np.diff(raw, 2, axis=0).std()
+    assert stream.describe()["smoothing_hz"] == 0.5
+    # Bodies and roots stand where the filtered points do.
+    np.testing.assert_allclose(frames[-1].lifted.root, smooth[-1][:, [11, 12]].mean(1))
+    np.testing.assert_array_equal(answers(0.0)[0], raw)
