@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from msg_adapters import ai, hri, opendr, openpose, point_cloud2, pose_array, yolo, zed
 from msg_adapters.camera_info import read_camera_info
+from msg_adapters.depth_image import DepthImage, read_depth
 from msg_adapters.keypoints import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, join
 
 #: Type name -> reader(msg, points, source) -> Keypoints2D.
@@ -63,6 +64,7 @@ def named_layout(type_name: str, msg) -> str | None:
 __all__ = [
     "ONE_PERSON",
     "SUPPORTED",
+    "DepthImage",
     "Intrinsics",
     "Keypoints2D",
     "MessageError",
@@ -72,4 +74,5 @@ __all__ = [
     "named_layout",
     "read",
     "read_camera_info",
+    "read_depth",
 ]

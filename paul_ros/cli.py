@@ -49,7 +49,7 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
         "--output",
         metavar="OUT.mcap",
         type=Path,
-        help="write the lifted bag: /lifter/poses, keypoints3d, markers, layout and the input topics",
+        help="write the lifted bag: /lifter/poses, bodies, keypoints3d, markers, layout and the input topics",
     )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the report as JSON")
     parser.add_argument(
@@ -80,6 +80,12 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
         help="without it the output is in model units (default: %(default)s)",
     )
     parser.add_argument(
+        "--depth-topic",
+        default="/depth",
+        metavar="TOPIC",
+        help="depth images aligned to the image of the keypoints, if the bag has any (default: %(default)s)",
+    )
+    parser.add_argument(
         "--ground-truth-topic",
         default="/ground_truth/poses",
         metavar="TOPIC",
@@ -95,7 +101,7 @@ def _replay(args: argparse.Namespace) -> None:
     from paul_ros.stream import open_stream
 
     check_outputs([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
-    topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic)
+    topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
     with Ticker("replay") as tick:
         stream = open_stream(
             args.model, args.layout, output_layout=args.output_layout, person_height=args.person_height

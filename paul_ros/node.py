@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ROS 2 node `lifter`: a thin shell over LiftStream. The only place that imports rclpy.
 
-Subscribes `keypoints` (2D) and `camera_info` (optional); publishes ~/poses, ~/keypoints3d, ~/markers,
-~/layout and /diagnostics. Headers are the input's own.
+Subscribes `keypoints` (2D), `camera_info` and `depth` (optional); publishes ~/poses, ~/bodies, ~/keypoints3d,
+~/markers, ~/layout and /diagnostics. Headers are the input's own.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 
 import msg_adapters
@@ -104,6 +104,7 @@ class LifterNode(Node):
         self._layout = self.create_publisher(String, "~/layout", _LATCHED_QOS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
         self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, _INPUT_QOS)
+        self.create_subscription(Image, "depth", self._on_depth, _INPUT_QOS)
         self._publish_layout()
         self._look_timer = self.create_timer(_LOOK_SECONDS, self._look_for_input)
         # Steady: a simulation that stands still would hold the last image back.
@@ -191,6 +192,10 @@ class LifterNode(Node):
         if self.stream.notes["distorted_image"] and "distorted_image" not in self._warned:
             self._warn("distorted_image", self.stream.explanations["distorted_image"])
         self._publish_layout()
+
+    def _on_depth(self, msg: Image) -> None:
+        self.stream.depth(msg)
+        self._report_drops()
 
     def _on_keypoints(self, msg, info: dict) -> None:
         self._count_missed(info["publication_sequence_number"])
@@ -356,8 +361,8 @@ def _parse(argv: list[str]) -> None:
     """There are only ROS arguments; --help tells which, anything else is refused."""
     parser = argparse.ArgumentParser(
         prog="lifter",
-        description="Lift 2D keypoints to 3D: subscribes keypoints and camera_info, "
-        "publishes ~/poses, ~/keypoints3d, ~/markers, ~/layout and /diagnostics.",
+        description="Lift 2D keypoints to 3D: subscribes keypoints, camera_info and depth, "
+        "publishes ~/poses, ~/bodies, ~/keypoints3d, ~/markers, ~/layout and /diagnostics.",
         epilog="Set parameters with --ros-args -p NAME:=VALUE, topics with --ros-args -r keypoints:=TOPIC."
         f"\n\n{as_markdown()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -50,7 +50,13 @@ LEAST_POINTS = 4
 """That the truth of a person must have: three fit nearly any shape."""
 
 CAMERA_INFO, POSE_ARRAY = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseArray"
-_OPTIONS = {"keypoints": "--topic", "camera info": "--camera-info-topic", "ground truth": "--ground-truth-topic"}
+DEPTH_IMAGE = "sensor_msgs/msg/Image"
+_OPTIONS = {
+    "keypoints": "--topic",
+    "camera info": "--camera-info-topic",
+    "ground truth": "--ground-truth-topic",
+    "depth": "--depth-topic",
+}
 _MM = 1000.0
 _FLIP = 0.3  # of a person's size
 _FARTHEST = 1e9  # metres; what is farther off, or no number, is no truth
@@ -71,10 +77,11 @@ class Topics:
     keypoints: str = "/keypoints"
     camera_info: str = "/camera_info"
     truth: str = "/ground_truth/poses"
+    depth: str = "/depth"
 
     @property
-    def all(self) -> tuple[str, str, str]:
-        return self.keypoints, self.camera_info, self.truth
+    def all(self) -> tuple[str, ...]:
+        return self.keypoints, self.camera_info, self.truth, self.depth
 
 
 @dataclass(frozen=True)
@@ -163,6 +170,8 @@ class _Shell:
             return True
         if record.topic == self.topics.camera_info:
             self.done.stream.camera_info(_decoded(record, "camera info", CAMERA_INFO))
+        elif record.topic == self.topics.depth:
+            self.done.stream.depth(_decoded(record, "depth", DEPTH_IMAGE))
         else:
             self._take_truth(_decoded(record, "ground truth", POSE_ARRAY))
         return False

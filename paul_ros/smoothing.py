@@ -18,8 +18,8 @@ from paul_ros.lifter import Lifted
 
 SPEED_COEFFICIENT = 2.0
 """Hz that the cut-off rises by at a speed of one size per second; a person's size is the rms distance of its points
-from their mean. With 1 Hz at rest the accelerations in the bags fall from 58 to 23 mm a frame squared with noise, 13 to 9
-without (truth: 3 and 5), and N-MPJPE changes by less than a millimetre; half the coefficient lags behind."""
+from their mean. With 1 Hz at rest the accelerations in the bags fall from 58 to 23 mm a frame squared with noise, 13 to
+9 without (truth: 3 and 5), and N-MPJPE changes by less than a millimetre; half the coefficient lags behind."""
 
 SPEED_CUTOFF = 1.0
 """Hz, of the speed's own filter; the paper's."""

@@ -19,6 +19,7 @@ import numpy as np
 import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, outputs
 from paul_ros.bodies import Steady, body_rotations, quaternions
+from paul_ros.depth import SURFACE, Depths
 from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
 from paul_ros.model import load_model
 from paul_ros.parameters import checked
@@ -168,6 +169,7 @@ class LiftStream:
         self._gathered = _Gathered()
         self._steady = Steady()
         self._filter = OneEuro(smoothing)
+        self._depths = Depths()
 
     @property
     def route(self) -> Route:
@@ -210,6 +212,11 @@ class LiftStream:
                     "CameraInfo has distortion but no P, so K is used: positions are a little wrong unless the "
                     "keypoints are of an undistorted image; let the camera's driver fill P and rectify the image"
                 )
+
+    def depth(self, msg) -> None:
+        """Keeps a depth image; an unusable one is a counted drop."""
+        with self.guard():
+            self._depths.add(msg_adapters.read_depth(msg))
 
     def keypoints(self, type_name: str, msg, topic: str = "") -> Frame | None:
         """Lifts one message; None = dropped, counted and explained. Zero persons are a frame too.
@@ -311,6 +318,10 @@ class LiftStream:
         for reason in filter(None, lifted.reason):
             self._drop("person_" + reason, f"{_LEFT_OUT[reason]}; this person is left out of the outputs")
         model, route = self.lifter.model, self.route
+        # What is no person has its root anywhere, on its skin for all that is known.
+        surface = SURFACE if model.stature else 0.0
+        lifted, said = self._depths.place(lifted, given.stamp, self.intrinsics, surface)
+        self.notes += Counter(said)
         lifted = self._filter(given.ids, given.stamp, lifted, model.layout.root)
         unit = self.lifter.metres_per_unit if lifted.units == "m" else 1.0
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
@@ -378,7 +389,7 @@ def _scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) 
     uncorrected = ", whose distortion is not corrected" if intrinsics.distorted else ""
     return (
         "the model's metres per unit; distance from the camera's focal length, "
-        f"CameraInfo's {intrinsics.matrix}: {image}{uncorrected}"
+        f"CameraInfo's {intrinsics.matrix}: {image}{uncorrected}; both from `depth` where that has a value at the root"
     )
 
 
