@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msg_adapters.keypoints import Intrinsics
-from paul_ros.model import Model, ModelError, enough_visible
+from paul_ros.model import Model, ModelError, RigidModel, enough_visible
 from paul_ros.onp import onp
 from paul_ros.placement import centred_view, place
 from paul_ros.refine import refine
@@ -197,6 +197,8 @@ class Lifter:
     def _fit_sure(self, W: np.ndarray, visible: np.ndarray, pinhole: bool) -> _Fit:
         """Fits, once more without the points that must be misdetections, where enough are left."""
         fit = self._fit(W, visible, pinhole)
+        if isinstance(self.model, RigidModel):
+            return fit  # What the mean shape misses is its own fault.
         sure = visible & ~_wild(fit.missed, visible, fit.extent)
         again = np.flatnonzero((sure != visible).any(1) & enough_visible(sure, self.model.layout))
         if not len(again):

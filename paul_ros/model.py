@@ -155,7 +155,7 @@ def enough_visible(visible: np.ndarray, layout: Layout) -> np.ndarray:
 
     Arrays and tensors alike.
     """
-    enough = [visible[:, list(part.points)].sum(1) >= min_visible(layout, part) for part in layout.parts]
+    enough = [visible[:, part.columns].sum(1) >= min_visible(layout, part) for part in layout.parts]
     return functools.reduce(operator.or_, enough)
 
 
@@ -197,8 +197,8 @@ def to_centre(S: np.ndarray, layout: Layout) -> np.ndarray:
     """Shapes (N,3,P) about the mean of their points; each category's about its own."""
     centred = np.empty_like(S)
     for part in layout.parts:
-        points = list(part.points)
-        centred[:, :, points] = S[:, :, points] - S[:, :, points].mean(2, keepdims=True)
+        points = S[:, :, part.columns]
+        centred[:, :, part.columns] = points - points.mean(2, keepdims=True)
     return centred
 
 
@@ -211,13 +211,13 @@ def to_unit_size(S: np.ndarray, layout: Layout) -> np.ndarray:
     """
     S = to_centre(S, layout)
     for part in layout.parts:
-        points = list(part.points)
         if part.edges:
-            start, end = np.array(part.edges).T
-            size = np.linalg.norm(S[:, :, start] - S[:, :, end], axis=1).mean(1)
+            start, end = part.ends
+            bones = S[:, :, start] - S[:, :, end]
+            size = np.sqrt((bones * bones).sum(1)).mean(1)
         else:
-            size = np.sqrt((S[:, :, points] ** 2).sum((1, 2)) / len(points))
-        S[:, :, points] /= np.maximum(size, 1e-6)[:, None, None]
+            size = np.sqrt((S[:, :, part.columns] ** 2).sum((1, 2)) / len(part.points))
+        S[:, :, part.columns] /= np.maximum(size, 1e-6)[:, None, None]
     return S
 
 

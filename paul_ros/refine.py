@@ -85,14 +85,15 @@ def _step(pose: _State, w: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray,
     d times the first two parts of that less (u, v) times the third.
     """
     N, _, P = pose.Y.shape
-    parts = np.concatenate([np.zeros((N, 1, P)), np.ones((N, 1, P)), pose.Y, -pose.Y], axis=1)
-    moved = parts[:, _MOVED].reshape(N, 6, 3, P)
+    parts = np.zeros((N, 8, P))
+    parts[:, 1], parts[:, 2:5], parts[:, 5:] = 1.0, pose.Y, -pose.Y
+    moved = parts.take(_MOVED, axis=1).reshape(N, 6, 3, P)
     J = (moved[:, :, :2] - pose.image[:, None] * moved[:, :, 2:]) * pose.inverse[:, None, None]
-    J = J.reshape(N, 6, 2 * P)
-    weighted = (J.reshape(N, 6, 2, P) * w[:, None, None]).reshape(N, 6, 2 * P)
-    H = weighted @ J.transpose(0, 2, 1)
-    H[:, range(6), range(6)] *= 1 + damping[:, None]
-    H[:, range(6), range(6)] += _TINY
+    weighted = (J * w[:, None, None]).reshape(N, 6, 2 * P)
+    H = weighted @ J.reshape(N, 6, 2 * P).transpose(0, 2, 1)
+    diagonal = H.reshape(N, 36)[:, ::7]
+    diagonal *= 1 + damping[:, None]
+    diagonal += _TINY
     step = np.linalg.solve(H, weighted @ pose.error.reshape(N, 2 * P, 1))[..., 0]
     return _rotation(step[:, 3:]), step[:, :3]
 

@@ -64,6 +64,18 @@ class Part:
     points: tuple[int, ...]
     edges: tuple[tuple[int, int], ...]
 
+    @cached_property
+    def columns(self) -> slice | list[int]:
+        """The points as an index of arrays; those that lie side by side as a slice, which copies nothing."""
+        first, last = self.points[0], self.points[-1]
+        together = self.points == tuple(range(first, last + 1))
+        return slice(first, last + 1) if together else list(self.points)
+
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """(2,E) indices of the edges' ends."""
+        return np.array(self.edges, int).reshape(-1, 2).T
+
 
 @dataclass(frozen=True)
 class Layout:
