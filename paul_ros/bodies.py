@@ -12,39 +12,49 @@ import numpy as np
 
 from paul_ros.skeleton import Layout
 
+_CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
 _LEAST_SINE = 1e-6  # between left and up: less fixes no plane
 
 
-def body_rotations(points: np.ndarray, rotation: np.ndarray, layout: Layout) -> np.ndarray:
+def left_and_up(layout: Layout) -> np.ndarray | None:
+    """(2,P): times points (P,3) a vector to the left and one up; None where the layout tells neither."""
+    place = {name: index for index, name in enumerate(layout.names)}
+    if set(_CORNERS) <= set(place):
+        left_hip, right_hip, left_shoulder, right_shoulder = (place[name] for name in _CORNERS)
+        left, right = (left_hip, left_shoulder), (right_hip, right_shoulder)
+        below, above = (left_hip, right_hip), (left_shoulder, right_shoulder)
+    elif layout.handedness:
+        rule = layout.handedness[0]
+        left, right, below, above = rule.left, rule.right, rule.below, rule.above
+    else:
+        return None
+    measures = np.zeros((2, len(layout.names)))
+    for row, sign, points in ((0, 1, left), (0, -1, right), (1, 1, above), (1, -1, below)):
+        measures[row, list(points)] += sign / len(points)
+    return measures
+
+
+def body_rotations(points: np.ndarray, rotation: np.ndarray, measures: np.ndarray | None) -> np.ndarray:
     """Rotations (N,3,3) from body axes to the camera's frame.
 
     Args:
-        points: (N,P,3) lifted points of the layout, camera frame.
+        points: (N,P,3) lifted points of a layout, camera frame.
         rotation: (N,3,3) canonical frame to camera frame, taken where the points or the layout tell nothing else.
+        measures: (2,P), what `left_and_up` gives for that layout.
     """
-    ends = _ends(layout)
-    if ends is None:
+    if measures is None:
         return rotation
-    left, right, above, below = (points[:, list(part)].mean(1) for part in ends)
-    z, y = above - below, left - right
-    x = np.cross(y, z)
-    lengths = [np.linalg.norm(axis, axis=1, keepdims=True) for axis in (x, y, z)]
-    x, z = (axis / np.where(length > 0, length, 1.0) for axis, length in ((x, lengths[0]), (z, lengths[2])))
-    axes = np.stack([x, np.cross(z, x), z], axis=2)
+    y, z = (measures @ points).transpose(1, 0, 2)
+    x = _cross(y, z)
+    lengths = np.sqrt([(axis * axis).sum(1) for axis in (x, y, z)])[..., None]
     fixed = lengths[0] > _LEAST_SINE * lengths[1] * lengths[2]
-    return np.where(fixed[:, :, None], axes, rotation)
+    x, z = x / np.where(fixed, lengths[0], 1.0), z / np.where(fixed, lengths[2], 1.0)
+    return np.where(fixed[:, :, None], np.stack([x, _cross(z, x), z], axis=2), rotation)
 
 
-def _ends(layout: Layout) -> tuple[tuple[int, ...], ...] | None:
-    """Points whose means are to the left, the right, above and below."""
-    place = {name: index for index, name in enumerate(layout.names)}
-    try:
-        hips = place["left_hip"], place["right_hip"]
-        shoulders = place["left_shoulder"], place["right_shoulder"]
-    except KeyError:
-        rule = next(iter(layout.handedness), None)
-        return rule and (rule.left, rule.right, rule.above, rule.below)
-    return (hips[0], shoulders[0]), (hips[1], shoulders[1]), shoulders, hips
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products of vectors (N,3); numpy's own takes ten times as long for a few."""
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def quaternions(R: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 
 import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, outputs
-from paul_ros.bodies import Steady, body_rotations, quaternions
+from paul_ros.bodies import Steady, body_rotations, left_and_up, quaternions
 from paul_ros.depth import SURFACE, Depths
 from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
 from paul_ros.model import load_model
@@ -167,7 +167,7 @@ class LiftStream:
         self._last_stamp: int | None = None
         self._image_size: tuple[int, int] | None = None
         self._gathered = _Gathered()
-        self._steady = Steady()
+        self._measures, self._steady = left_and_up(lifter.model.layout), Steady()
         self._filter = OneEuro(smoothing)
         self._depths = Depths()
 
@@ -327,7 +327,7 @@ class LiftStream:
         width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
         visible = np.where(lifted.ok[:, None], lifted.used, given.visible)
         used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))
-        axes = body_rotations(lifted.points, lifted.rotation, model.layout)
+        axes = body_rotations(lifted.points, lifted.rotation, self._measures)
         return Frame(
             header,
             route.keypoints_out(used),

@@ -10,7 +10,7 @@ import pytest
 from conftest import PERSON
 from scipy.spatial.transform import Rotation
 
-from paul_ros.bodies import Steady, body_rotations, quaternions
+from paul_ros.bodies import Steady, body_rotations, left_and_up, quaternions
 from paul_ros.skeleton import Layout, load_layout
 
 COCO = load_layout("coco17")
@@ -24,7 +24,7 @@ FACING = np.array([(0, 0, -1), (1, 0, 0), (0, -1, 0)], float).T
 def test_axes_turn_with_the_person(turn):
     R = Rotation.from_euler("xyz", turn).as_matrix()
     points = (PERSON @ R.T + (0.5, 0, 3))[None]
-    axes = body_rotations(points, np.full((1, 3, 3), np.nan), COCO)
+    axes = body_rotations(points, np.full((1, 3, 3), np.nan), left_and_up(COCO))
     np.testing.assert_allclose(axes[0], R @ FACING, atol=0.05)  # who leans 2 degrees back
     np.testing.assert_allclose(axes[0].T @ axes[0], np.eye(3), atol=1e-12)
     assert np.linalg.det(axes[0]) == pytest.approx(1)
@@ -34,7 +34,7 @@ def test_a_bend_of_one_shoulder_moves_the_axes_little():
     """x stays across left and up, z to the middle of the shoulders."""
     points = PERSON.copy()
     points[5] += (0, -0.1, 0.1)
-    axes = body_rotations(points[None], np.eye(3)[None], COCO)[0]
+    axes = body_rotations(points[None], np.eye(3)[None], left_and_up(COCO))[0]
     up = points[5:7].mean(0) - points[11:13].mean(0)
     np.testing.assert_allclose(axes[:, 2], up / np.linalg.norm(up))
     assert Rotation.from_matrix(axes.T @ FACING).magnitude() < np.radians(25)
@@ -46,7 +46,7 @@ def test_a_layout_without_hips_uses_its_rule_of_handedness():
     rename = dict(zip(COCO.names, names))
     data["handedness"] = [{part: [rename[n] for n in points] for part, points in data["handedness"][0].items()}]
     data |= {"names": names, "edges": [], "left_right": [], "derived": {}, "root": names[:1]}
-    axes = body_rotations(PERSON[None], np.full((1, 3, 3), np.nan), Layout.from_dict(data))[0]
+    axes = body_rotations(PERSON[None], np.full((1, 3, 3), np.nan), left_and_up(Layout.from_dict(data)))[0]
     # Of the head: it is upright and looks at the camera.
     np.testing.assert_allclose(axes, FACING, atol=0.1)
 
@@ -54,13 +54,13 @@ def test_a_layout_without_hips_uses_its_rule_of_handedness():
 def test_a_thing_without_chest_has_the_models_own_rotation():
     door = replace(COCO, names=tuple(f"d{n}" for n in range(17)), handedness=())
     R = Rotation.random(3, random_state=0).as_matrix()
-    np.testing.assert_array_equal(body_rotations(np.zeros((3, 17, 3)), R, door), R)
+    np.testing.assert_array_equal(body_rotations(np.zeros((3, 17, 3)), R, left_and_up(door)), R)
 
 
 def test_points_that_fix_no_axes_give_the_models_own_rotation():
     R = Rotation.random(2, random_state=0).as_matrix()
     flat = np.stack([np.zeros((17, 3)), PERSON * (0, 1, 0)])
-    np.testing.assert_array_equal(body_rotations(flat, R, COCO), R)
+    np.testing.assert_array_equal(body_rotations(flat, R, left_and_up(COCO)), R)
 
 
 def test_quaternions_are_those_of_scipy():
