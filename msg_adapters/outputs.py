@@ -49,8 +49,7 @@ def keypoints_cloud(make, header, xy: np.ndarray, confidence: np.ndarray, person
     """
     persons, points = confidence.shape
     ids = np.broadcast_to(id_numbers(person_ids)[:, None], (persons, points))
-    columns = [xy[..., 0], xy[..., 1], confidence, ids]
-    return _cloud(make, header, ("x", "y", "confidence", "person_id"), columns, bool(np.isfinite(xy).all()))
+    return _cloud(make, header, ("x", "y", "confidence", "person_id"), [xy[..., 0], xy[..., 1], confidence, ids])
 
 
 def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids, ambiguity, distance_sigma):
@@ -70,7 +69,6 @@ def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids, 
         header,
         ("x", "y", "z", "confidence", "keypoint", "person_id", "ambiguity", "distance_sigma"),
         [points[..., 0], points[..., 1], points[..., 2], confidence, keypoint, *each],
-        is_dense=bool(np.isfinite(points).all()),
     )
 
 
@@ -123,8 +121,8 @@ def _id_number(text: str, row: int) -> int:
     return int(digits) if known else row
 
 
-def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray], is_dense: bool):
-    """An organised float32 PointCloud2 of columns, each (height, width); is_dense: no coordinate is NaN."""
+def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray]):
+    """An organised float32 PointCloud2 of columns, each (height, width)."""
     data = np.stack(columns, axis=-1).astype("<f4")
     height, width, count = data.shape
     fields = [
@@ -141,7 +139,7 @@ def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray], is_d
         point_step=4 * count,
         row_step=4 * count * width,
         data=make.octets(data.tobytes()),
-        is_dense=is_dense,
+        is_dense=bool(np.isfinite(data).all()),
     )
 
 

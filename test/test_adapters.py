@@ -430,7 +430,7 @@ def test_points_cloud_writer(make, bag_make):
             confidence,
             ("7", "anna", "99999999999"),
             np.array([0.0, 0.5, 1.0]),
-            np.array([0.1, 0.2, np.nan]),
+            np.array([0.1, 0.2, 0.3]),
         ),
     )
     assert (msg.height, msg.width, msg.point_step, msg.row_step) == (3, P, 32, 32 * P)
@@ -438,7 +438,7 @@ def test_points_cloud_writer(make, bag_make):
     assert [field.name for field in msg.fields] == names
     data = np.frombuffer(msg.data, "<f4").reshape(3, P, 8)
     np.testing.assert_array_equal(data[..., 6], np.tile(np.float32([[0], [0.5], [1]]), P))
-    np.testing.assert_array_equal(data[:, 3, 7], np.float32([0.1, 0.2, np.nan]))
+    np.testing.assert_array_equal(data[:, 3, 7], np.float32([0.1, 0.2, 0.3]))
     np.testing.assert_array_equal(data[..., :3], points)
     np.testing.assert_array_equal(data[..., 3], 0.5)
     np.testing.assert_array_equal(data[..., 4], np.tile(np.arange(P), (3, 1)))
