@@ -9,6 +9,10 @@ from dataclasses import dataclass
 import yaml
 
 
+class ParameterError(ValueError):
+    """A value that a parameter cannot have; the text says which it can."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One parameter. `limits`: inclusive (low, high) of a number; `live`: may change while the node runs."""
@@ -68,11 +72,11 @@ DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 
 
 def checked(values: dict) -> dict:
-    """Values of parameters by name, the others' defaults added; raises ValueError for a number out of its limits."""
+    """Values of parameters by name, the others' defaults added; raises ParameterError for a number out of its limits."""
     for parameter in PARAMETERS:
         value, (low, high) = values.get(parameter.name, parameter.default), parameter.limits or (None, None)
         if parameter.limits and not low <= value <= high:
-            raise ValueError(f"{parameter.name} is {value}; it must lie from {low} to {high}")
+            raise ParameterError(f"{parameter.name} is {value}; it must lie from {low} to {high}")
     return {**DEFAULTS, **values}
 
 

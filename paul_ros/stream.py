@@ -109,7 +109,7 @@ OUTPUTS = {
 def open_stream(model: str | None = None, layout: str | None = None, **parameters) -> LiftStream:
     """The stream of the node's parameters; one that is left out, or None, has its default.
 
-    Raises ModelError, LayoutError, ValueError.
+    Raises ModelError, LayoutError, ParameterError.
     """
     given = {"model": model, "layout": layout, **parameters}
     values = checked({name: value for name, value in given.items() if value is not None})

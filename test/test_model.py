@@ -101,10 +101,11 @@ def test_another_format_version_is_refused(tmp_path):
         load_model(tmp_path / "old.npz")
 
 
+@pytest.mark.parametrize("name", ["metres_per_unit", "stature"])
 @pytest.mark.parametrize("metres", [1e300, True, 0.0, -1.0, float("nan"), "0.3"])
-def test_absurd_metres_are_not_saved(tmp_path, metres):
-    with pytest.raises(ModelError, match="metres_per_unit"):
-        save_model(tmp_path / "bad.npz", header(metres_per_unit=metres), arrays())
+def test_absurd_metres_are_not_saved(tmp_path, name, metres):
+    with pytest.raises(ModelError, match=name):
+        save_model(tmp_path / "bad.npz", header(**{name: metres}), arrays())
     assert not list(tmp_path.iterdir())
 
 

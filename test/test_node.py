@@ -20,6 +20,7 @@ from foreign_messages import HRI, OPENDR, LiveMake, hri, opendr
 import msg_adapters
 from msg_adapters import outputs
 from paul_ros import parameters
+from paul_ros.depth import SURFACE
 from paul_ros.skeleton import load_layout
 from paul_ros.stream import OUTPUTS
 
@@ -47,6 +48,7 @@ class Bench:
             class_of(kind), "keypoints", QoSProfile(depth=10, reliability=reliability)
         )
         self.camera = self.node.create_publisher(class_of("sensor_msgs/msg/CameraInfo"), "camera_info", 10)
+        self.depth = self.node.create_publisher(class_of("sensor_msgs/msg/Image"), "depth", 10)
         for name, type_name in OUTPUTS.items():
             self.node.create_subscription(class_of(type_name), f"lifter/{name}", self.got[name].append, 10)
         self.node.create_subscription(String, "lifter/layout", self.got["layout"].append, latched)
@@ -72,7 +74,7 @@ class Bench:
     def matched(self) -> None:
         """Until publishers and subscribers of both sides know each other: all outputs answer probes."""
         self.until(
-            lambda: self.keypoints.get_subscription_count() and self.camera.get_subscription_count(),
+            lambda: all(p.get_subscription_count() for p in (self.keypoints, self.camera, self.depth)),
             "subscriptions of the node",
         )
 
@@ -103,8 +105,11 @@ class Bench:
         assert len(poses) == 17
         return np.array([(p.position.x, p.position.y, p.position.z) for p in poses]).reshape(-1, 17, 3)
 
+    def layout(self) -> dict:
+        return json.loads(self.got["layout"][-1].data)
+
     def units(self) -> str:
-        return json.loads(self.got["layout"][-1].data)["units"]
+        return self.layout()["units"]
 
     def next_diagnostics(self):
         """The first status that was made after now; one may be on its way already."""
@@ -114,6 +119,22 @@ class Bench:
 
     def diagnosed(self) -> dict:
         return {pair.key: pair.value for pair in self.next_diagnostics().values}
+
+
+def half_way(seconds: int):
+    """A depth image of a wall 2 m away."""
+    header = header_of(MAKE, seconds=seconds)
+    values = np.full((480, 640), 2000, "<u2")
+    return MAKE(
+        "sensor_msgs/msg/Image",
+        header=header,
+        height=480,
+        width=640,
+        encoding="16UC1",
+        is_bigendian=0,
+        step=1280,
+        data=MAKE.octets(values.tobytes()),
+    )
 
 
 def header_in(msg):
@@ -319,6 +340,11 @@ def test_parameters_may_change_where_the_table_says_so(bench):
     bench.lifts()
     assert int(bench.diagnosed()["dropped_too_many_persons"]) >= 1
     assert set_parameter(bench, max_persons=64, min_confidence=0.5) == [True, True]
+    assert set_parameter(bench, person_height=1.2, smoothing=2.0) == [True, True]
+    told = ("person_height", "size_spread", "smoothing_hz")
+    bench.until(lambda: [bench.layout()[key] for key in told] == [1.2, 0, 2], "the new layout")
+    assert set_parameter(bench, person_height=0.0, smoothing=0.0) == [True, True]
+    bench.until(lambda: [bench.layout()[key] for key in told] == [1.7, 0.06, 0], "the old layout")
     assert set_parameter(bench, min_confidence=1.5) == [False]
     assert set_parameter(bench, model="other") == [False]
 
@@ -362,6 +388,15 @@ def test_camera_info_turns_model_units_into_metres(ros, start_lifter, model_file
     points = bench.lifts()
     assert np.linalg.norm(points - GOOD, axis=-1).max() < 0.15
     assert bench.diagnosed()["units"] == "m"
+
+    def measured():
+        # For the frame after the next: by then it has come, if it was not lost on the way.
+        bench.depth.publish(half_way(bench.stamp + 2))
+        return bench.lifts()[0, 0, 2] > 3 > bench.lifts()[0, 0, 2]
+
+    bench.until(measured, "the measured depth")
+    assert int(bench.diagnosed()["noted_depth_used"]) >= 1
+    assert bench.answer("bodies", bench.stamp).poses[0].position.z == pytest.approx(2 + SURFACE, abs=1e-3)
     distorted = camera_info(MAKE)
     distorted.d = array.array("d", [-0.3, 0.1, 0, 0, 0])
     for _ in range(2):

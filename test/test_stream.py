@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from msg_adapters import outputs
 from paul_ros.lifter import Lifter
 from paul_ros.model import ModelError, load_model
+from paul_ros.parameters import ParameterError
 from paul_ros.skeleton import Layout, LayoutError, load_layout
 from paul_ros.stream import OUTPUTS, LiftStream, open_stream
 
@@ -378,7 +379,7 @@ def test_a_height_that_the_model_cannot_have_is_refused(model_file):
 
 
 def test_parameters_out_of_their_limits_are_refused(model_file):
-    with pytest.raises(ValueError, match="person_height is -1.0.*0.0 to 3.0"):
+    with pytest.raises(ParameterError, match="person_height is -1.0.*0.0 to 3.0"):
         open_stream(str(model_file), person_height=-1.0)
 
 
