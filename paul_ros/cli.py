@@ -103,9 +103,8 @@ def _replay(args: argparse.Namespace) -> None:
     check_outputs([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
     with Ticker("replay") as tick:
-        stream = open_stream(
-            args.model, args.layout, output_layout=args.output_layout, person_height=args.person_height
-        )
+        more = {name: getattr(args, name) for name in ("output_layout", "person_height", "smoothing")}
+        stream = open_stream(args.model, args.layout, **more)
         done = replay(args.bag, stream, args.output, topics, tick)
     report = evaluate(done)
     if args.json:

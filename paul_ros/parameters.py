@@ -72,7 +72,7 @@ DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 
 
 def checked(values: dict) -> dict:
-    """Values of parameters by name, the others' defaults added; raises ParameterError for a number out of its limits."""
+    """Values by name, the defaults of the others added; raises ParameterError for a number out of its limits."""
     for parameter in PARAMETERS:
         value, (low, high) = values.get(parameter.name, parameter.default), parameter.limits or (None, None)
         if parameter.limits and not low <= value <= high:

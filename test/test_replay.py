@@ -433,3 +433,13 @@ def test_who_has_no_id_has_no_flips(short, model_file):
     for frame in done.frames:
         object.__setattr__(frame.keypoints, "ids", ("",) * len(frame.keypoints.ids))
     assert flips(done.frames) == {"pairs_of_frames": 0, "flips_per_1000_frames": None}
+
+
+def test_the_filter_works_in_replay_as_in_the_stream(short, model_file, tmp_path):
+    """And what is written are the filtered points."""
+    raw, calm = (replay(short, open_stream(model_file, smoothing=hz), tmp_path / f"{hz}.mcap") for hz in (0.0, 0.5))
+    moved = [np.abs(a.lifted.points - b.lifted.points)[a.lifted.ok] for a, b in zip(raw.frames, calm.frames)]
+    assert np.concatenate(moved).max() > 0.05
+    for (_, _, message, _), frame in zip(read_messages(tmp_path / "0.5.mcap", ["/lifter/bodies"]), calm.frames):
+        roots = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses]).reshape(-1, 3)
+        np.testing.assert_allclose(roots, frame.lifted.points[frame.lifted.ok][:, [11, 12]].mean(1))
