@@ -27,7 +27,7 @@ SIZES = (0.4, 1.4)
 
 _WINDOW = 0.04  # metres, half the side of the window
 _NEAR = 20_000_000  # ns between the stamps of an image and its depths
-_KEPT = 30  # images: a detector may be a second behind
+_KEPT = 15  # images, half a second at 30 Hz: so far behind may a detector be
 
 
 class Depths:

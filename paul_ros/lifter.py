@@ -47,8 +47,8 @@ class Lifted:
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
         reprojection: (N,) pixels, root mean square over the points used.
-        ambiguity: (N,) 0..1, residual of the pose over that of its depth-reversed rival, the second optimum; 0 where
-            there is none, 1 where the image cannot tell them apart.
+        ambiguity: (N,) 0..1, residual of the pose over that of its depth-reversed rival, the second optimum of
+            orthographic-N-point; 0 where there is none, 1 where the image cannot tell them apart.
         certified: (N,) the pose, or what a pinhole camera's was refined from, is the proven optimum of
             orthographic-N-point.
         distance_sigma: (N,) metres, standard deviation of the root's distance: that of people's heights, unless the
