@@ -23,7 +23,7 @@ _ROWS = (
     ("root error, median", "root_error_median_mm", "mm"),
     ("root error, median", "root_error_median_percent", "% of distance"),
 )
-_SIDE_COLOUR = {"left": "#1f77d0", "right": "#e4572e", "": "#444444"}
+SIDE_COLOUR = {"left": "#1f77d0", "right": "#e4572e", "": "#444444"}
 _TRUTH_COLOUR = "#c4c4c4"
 _VIEWS = (("seen by the camera", 0), ("seen from the right, camera at the left", 2))
 _WIDEST, _TALLEST = 3.6, 3.6  # inches of one panel
@@ -206,11 +206,11 @@ def _draw_bones(ax: Any, done: Replay, points: np.ndarray, truth: bool = False) 
         style = (
             dict(color=_TRUTH_COLOUR, linewidth=6.0, zorder=1)
             if truth
-            else dict(color=_SIDE_COLOUR[side], linewidth=2.2, zorder=2)
+            else dict(color=SIDE_COLOUR[side], linewidth=2.2, zorder=2)
         )
         ax.plot(*points[[a, b]].T, solid_capstyle="round", **style)
     if not truth:
-        ax.scatter(*points.T, s=9, zorder=3, linewidths=0, c=[_SIDE_COLOUR[side] for side in layout.sides])
+        ax.scatter(*points.T, s=9, zorder=3, linewidths=0, c=[SIDE_COLOUR[side] for side in layout.sides])
 
 
 def _draw_errors(ax: Any, done: Replay, chosen: list[LiftedFrame]) -> None:
