@@ -102,6 +102,29 @@ def test_points_taken_for_a_persons_are_noted(tmp_path):
     assert load(tmp_path, load_layout("coco17"), W=views(points=17)).notes == ()
 
 
+def test_detections_go_with_their_frames(tmp_path):
+    """Where a point is not marked it is not detected; frames of which too little is detected are left out."""
+    W = views()
+    detected = W + 1
+    detected[1, :, :6] = np.nan
+    W[2, :, 3] = np.nan
+    data = load(tmp_path, W=W, detected=detected)
+    assert data.left_out == 1
+    kept = np.delete(np.arange(6), 1)
+    expected = np.where(np.isnan(W), np.nan, detected)[kept].astype(np.float32)
+    np.testing.assert_array_equal(data.detected, expected)
+    assert data.sha256 != load(tmp_path, W=W, detected=detected + 1).sha256
+
+
+@pytest.mark.parametrize(
+    "detected, told",
+    [(views(points=8), "detected in .* must be numbers"), (views() * 1e5, "beyond 1e"), (np.array("x"), "be numbers")],
+)
+def test_bad_detections_are_refused(tmp_path, detected, told):
+    with pytest.raises(DataError, match=told):
+        load(tmp_path, W=views(), detected=detected)
+
+
 @pytest.mark.parametrize("frames, points", [(2, 9), (6, 3)])
 def test_too_little_for_any_shape_is_noted(tmp_path, frames, points):
     (note,) = load(tmp_path, W=views(frames, points)).notes

@@ -440,8 +440,12 @@ def test_the_command_makes_what_the_trainer_takes(archive, tmp_path):
     data = load_training_data(tmp_path / "2d.npz", human_layout())
     assert data.calibrated and data.left_out == 0 and len(data.W) > 100
     with np.load(tmp_path / "2d.npz", allow_pickle=False) as two, np.load(tmp_path / "3d.npz") as three:
-        assert sorted(two.files) == ["W", "about", "calibrated", "visible"]
-        np.testing.assert_array_equal(two["W"], three["W"])
+        assert sorted(two.files) == ["W", "about", "calibrated", "detected"]
+        np.testing.assert_array_equal(np.isfinite(two["detected"]).all(1), three["visible"])
+        np.testing.assert_array_equal(np.nan_to_num(two["detected"]), three["W"])
+        far = np.ptp(two["W"], axis=2).max(1) < 0.5  # else what is near a camera is too far from a parallel projection
+        off = three["S"][far, :2] / three["S"][far, :2].std((1, 2))[:, None, None]
+        assert np.corrcoef(off.ravel(), two["W"][far].ravel())[0, 1] > 0.9
         assert three["S"].shape == (len(data.W), 3, 43)
         assert b'"views": 2' in two["about"].tobytes() and b"90_02" in two["about"].tobytes()
     again = command(archive, "-o", tmp_path / "again.npz", "--set", "views.views=2", "--quiet")

@@ -15,7 +15,7 @@ from paul_ros.onp import onp
 from paul_ros.skeleton import load_layout
 from training import starting, trainer
 from training.encoder_fit import fit_encoder
-from training.objective import fit
+from training.objective import Views, fit
 from training.recipe import Recipe, RecipeError
 from training.reconstruction import final_loss
 from training.trainer import Trainer, TrainingError, one_buffer, rule_share
@@ -198,10 +198,73 @@ def test_a_mirrored_start_explains_the_same_views():
     np.testing.assert_allclose(np.linalg.det(other.rotations), 1, rtol=1e-5)
 
 
+def lesson_of(data, start, scale="unit", calibrated=False):
+    """What a start of these frames teaches."""
+    W, visible, facing = torch.from_numpy(data.W), torch.from_numpy(data.visible), torch.ones(len(data.W), 1, 1)
+    views = Views.of(W, visible, facing, calibrated, data.image_unit if scale == "unit" else None)
+    return starting.Lesson.of(start, views, data.layout, scale)
+
+
+def test_a_shape_seen_by_its_own_camera_is_its_view():
+    """In the image's own units: a detector's errors are added to it."""
+    data, camera, R = sequence(layout=COCO)
+    lesson, own = lesson_of(data, true_start(data, camera, R)), torch.arange(40)
+    W = lesson.seen_by(own, lesson.shapes_of(own, None)).numpy()
+    np.testing.assert_allclose(W, data.W - data.W.mean(2, keepdims=True), atol=1e-3)
+
+
+def test_where_there_is_perspective_a_shape_is_seen_with_it():
+    """From the distances of the frames: what is nearer looks larger by their ratio."""
+    data, camera, R = sequence(layout=COCO)
+    S, distance = camera / 50, np.linspace(20, 60, 40)[:, None, None]
+    rays = (S[:, :2] / (distance + S[:, 2:])).astype(np.float32)
+    seen = replace(data, W=rays, calibrated=True)
+    unit = np.sqrt(((rays - rays.mean(2, keepdims=True)) ** 2).mean((1, 2)))[
+        :, None, None
+    ]  # of W where starts are found
+    start = starting.Start(np.arange(40), (np.swapaxes(R, 1, 2) @ S / distance / unit).astype(np.float32), R, -1, 2.5)
+    lesson, own = lesson_of(seen, start, "free", calibrated=True), torch.arange(40)
+    W = lesson.seen_by(own, lesson.shapes_of(own, None)).numpy()
+    parallel = S[:, :2] / distance
+    assert np.abs(W - rays).max() < 0.15 * np.abs(parallel - rays).max()
+
+
+def test_views_of_held_solutions_have_the_detectors_errors(tmp_path, searches):
+    """Most of them: some are as the points were marked, for so the lower level sees them.  Nothing else has any."""
+    data = sequence()[0]
+    detected = data.W + 7
+    detected[:, :, 0] = np.nan
+    run = Trainer(replace(data, detected=detected), Recipe.from_dict(HELD), tmp_path)
+    W = torch.rand(40, 2, 9)
+    seen, visible = run._detected_as(torch.arange(40), W)
+    reported = ~visible[:, 0]
+    assert 20 < reported.sum() < 36
+    torch.testing.assert_close(seen[~reported], W[~reported])
+    torch.testing.assert_close(seen[reported][:, :, 1:], W[reported][:, :, 1:] + 7, rtol=0, atol=1e-4)
+    assert visible[:, 1:].all()
+    np.testing.assert_array_equal(run.views(torch.arange(40)).visible.numpy(), data.visible)
+    run.prepare()
+    views, *_ = run._batch(trainer.HELD)
+    assert views.visible[:, 1:].all() and not views.visible.all()
+
+
+def test_starts_are_searched_for_where_perspective_is_least(tmp_path, monkeypatch):
+    data, camera, R = sequence(frames=30)
+    W = data.W * np.linspace(0.001, 0.002, 30)[:, None, None].astype(np.float32)[::-1]
+    far = ((W - W.mean(2, keepdims=True)) ** 2).sum((1, 2)).argsort()
+    found = starting.Start(np.array([3, 5]), np.zeros((2, 3, 9), np.float32), R[:2], 0.0, 1.0)
+    asked = []
+    monkeypatch.setattr(starting, "search", lambda kind, W, *rest: asked.append(W) or found)
+    run = Trainer(replace(data, W=W, calibrated=True), Recipe.from_dict({**HELD, "scale": "free"}), tmp_path)
+    start = run._search(None)
+    assert len(asked[0]) == 10
+    np.testing.assert_array_equal(start.rows, far[[3, 5]])
+
+
 def test_a_mirrored_object_has_a_mirrored_shape(tmp_path):
     """The shape to be learned for a view with left and right exchanged fits that view."""
     data, camera, R = sequence(layout=COCO)
-    lesson = starting.Lesson.of(true_start(data, camera, R), COCO, "unit", torch.device("cpu"))
+    lesson = lesson_of(data, true_start(data, camera, R))
     S = lesson.shapes_of(torch.arange(40), torch.ones(40, 1, 1, dtype=torch.bool)).numpy()
     W = (camera[:, :2] * [[-1], [1]])[:, :, COCO.mirror] / data.image_unit
     found = onp(S, W, data.visible, "unit")
@@ -216,7 +279,7 @@ def test_a_symmetric_object_mirrored_is_itself():
     start = starting.Start(
         np.arange(4), np.repeat(S[None], 4, 0).astype(np.float32), np.repeat(np.eye(3)[None], 4, 0), 0, 0
     )
-    lesson = starting.Lesson.of(start, COCO, "unit", torch.device("cpu"))
+    lesson = lesson_of(sequence(frames=4, layout=COCO)[0], start)
     plain, mirrored = (lesson.shapes_of(torch.arange(4), flag.expand(4, 1, 1)) for flag in torch.tensor([False, True]))
     torch.testing.assert_close(plain, mirrored, rtol=0, atol=1e-5)
 

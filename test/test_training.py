@@ -267,7 +267,7 @@ def test_lengths_that_are_none_are_refused_before_training(data_file, tmp_path, 
 def test_a_recipe_of_other_points_is_named(tmp_path):
     np.savez(tmp_path / "hand.npz", W=views()[0][:, :, :9])
     with pytest.raises(RecipeError, match="recipe human is for layouts with the points that it names: known_lengths"):
-        train(tmp_path / "hand.npz", "-o", tmp_path / "m.npz", "--recipe", "human", *SMALL)
+        train(tmp_path / "hand.npz", "-o", tmp_path / "m.npz", "--recipe", "human", *SMALL, "--set", "hold=0")
 
 
 def test_no_threads_are_refused(data_file, tmp_path):

@@ -40,6 +40,8 @@ def load_files(
         )
     if len(parts) == 1:
         return parts[0]
+    if any(part.detected is not None for part in parts):
+        raise DataError("`detected` is for a file that is trained on alone: join the arrays in one npz")
     if layout is not None or all(part.layout.name == "coco17" for part in parts):
         return one_after_another(parts)
     names = [Path(path).stem for path in paths]

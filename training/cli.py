@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     recipe = Recipe.load(args.recipe, args.set)
     folders = _run_folders(args, recipe)
     data, recipe = _load(args, recipe)
-    data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale)))
+    data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe)))
     _check(args, recipe, data)
     torch.set_num_threads(args.threads)
     device = _device(args.device)
@@ -142,6 +142,14 @@ def run(args: argparse.Namespace) -> int:
         if is_first():
             _write(runs, args)
     return 0
+
+
+def _unused(data: TrainingData, recipe: Recipe) -> tuple[str, ...]:
+    if data.detected is None or recipe.hold:
+        return ()
+    return (
+        "its detected points are left unused: only where solutions are held (setting hold) does h learn to read them",
+    )
 
 
 def _load(args: argparse.Namespace, recipe: Recipe) -> tuple[TrainingData, Recipe]:

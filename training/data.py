@@ -63,6 +63,8 @@ class TrainingData:
         source: file name, for provenance.
         left_out: frames that held fewer visible points than can be lifted.
         notes: what is odd about the data and does not forbid training, a sentence each.
+        detected: (F,2,P) float32, or None: the same points as a detector would give them, NaN where it would not. Where
+            solutions are held, h is taught to read such views; everything is explained from W.
     """
 
     W: np.ndarray
@@ -72,6 +74,7 @@ class TrainingData:
     source: str
     left_out: int
     notes: tuple[str, ...] = ()
+    detected: np.ndarray | None = None
 
     @cached_property
     def image_unit(self) -> float:
@@ -86,6 +89,8 @@ class TrainingData:
         """Digest of the arrays: a checkpoint belongs to the data it began with."""
         digest = hashlib.sha256(np.ascontiguousarray(self.W))
         digest.update(np.packbits(self.visible).tobytes())
+        if self.detected is not None:
+            digest.update(np.ascontiguousarray(self.detected))
         return digest.hexdigest()
 
 
@@ -129,9 +134,9 @@ def load_training_data(
     """Read 2D keypoints to train on.
 
     Args:
-        path: an ``.npz`` with ``W`` (F,2,P) and optionally ``visible`` (F,P) (or NaN where hidden) and ``calibrated``
-            (one bool: W are rays); or a bag (an ``.mcap`` or a rosbag2 folder) with one topic of 2D keypoints of any
-            message type that has an adapter, calibrated where it holds a CameraInfo.
+        path: an ``.npz`` with ``W`` (F,2,P) and optionally ``visible`` (F,P) (or NaN where hidden), ``calibrated``
+            (one bool: W are rays) and ``detected`` (F,2,P); or a bag (an ``.mcap`` or a rosbag2 folder) with one topic
+            of 2D keypoints of any message type that has an adapter, calibrated where it holds a CameraInfo.
         layout: what the points are; None: coco17 for 17 points and for bags, else an anonymous one, with ``edges``
             (E,2) of the npz where it has them.
         topic: which topic of a bag; needed only where it has several. It may have * for a part of its name, for
@@ -146,17 +151,18 @@ def load_training_data(
     if not path.exists():
         raise DataError(f"no data at '{path}'")
     guessed = layout is None and path.suffix == ".npz"
+    detected = None
     if path.suffix == ".npz":
-        W, visible, calibrated, layout = _read_npz(path, layout)
+        W, visible, calibrated, layout, detected = _read_npz(path, layout)
     else:
         layout = layout or load_layout(_USUAL)
         W, visible, calibrated = _read_bag(path, layout, topic, min_confidence)
-    return _checked(W, visible, layout, calibrated, path, guessed)
+    return _checked(W, visible, layout, calibrated, path, guessed, detected)
 
 
-def _read_npz(path: Path, layout: Layout | None) -> tuple[np.ndarray, np.ndarray, bool, Layout]:
+def _read_npz(path: Path, layout: Layout | None) -> tuple[np.ndarray, np.ndarray, bool, Layout, np.ndarray | None]:
     try:
-        arrays = read_npz(path, ("W",), ("visible", "calibrated", *([] if layout else ["edges"])))
+        arrays = read_npz(path, ("W",), ("visible", "calibrated", "detected", *([] if layout else ["edges"])))
     except NpzError as error:
         raise DataError(f"'{path}' {error} (training needs W (F,2,P))") from error
     W, layout = arrays["W"], layout or _guessed_layout(arrays, path)
@@ -175,7 +181,13 @@ def _read_npz(path: Path, layout: Layout | None) -> tuple[np.ndarray, np.ndarray
             f"W in '{path}' is NaN or infinite at {wrong} of {visible.sum()} visible points: hide missing points "
             f"in visible, or leave visible out and mark them by NaN"
         )
-    return W, visible, calibrated is not None and calibrated.size == 1 and bool(calibrated.all()), layout
+    detected = arrays.get("detected")
+    if detected is not None and (detected.shape != W.shape or detected.dtype.kind not in "fiu"):
+        raise DataError(
+            f"detected in '{path}' must be numbers {W.shape} to go with W, it is {detected.dtype} {detected.shape}"
+        )
+    calibrated = calibrated is not None and calibrated.size == 1 and bool(calibrated.all())
+    return W, visible, calibrated, layout, detected
 
 
 def _guessed_layout(arrays: dict[str, np.ndarray], path: Path) -> Layout:
@@ -280,11 +292,18 @@ def _told(refused: dict[str, str]) -> str:
 
 
 def _checked(
-    W: np.ndarray, visible: np.ndarray, layout: Layout, calibrated: bool, path: Path, guessed: bool
+    W: np.ndarray,
+    visible: np.ndarray,
+    layout: Layout,
+    calibrated: bool,
+    path: Path,
+    guessed: bool,
+    detected: np.ndarray | None,
 ) -> TrainingData:
     limit = RAY_LIMIT if calibrated else ABSURD
     visible = visible & np.isfinite(W).all(1)
-    if any((np.abs(W[rows]).max(1) > limit)[visible[rows]].any() for rows in _blocks(len(W))):
+    beyond = any((np.abs(W[rows]).max(1) > limit)[visible[rows]].any() for rows in _blocks(len(W)))
+    if beyond or (detected is not None and (np.abs(detected) > limit).any()):
         raise DataError(
             f"'{path}' has image points beyond {limit:g}: no {'rays' if calibrated else 'pixels'}; "
             f"mark missing points as hidden or NaN"
@@ -298,12 +317,16 @@ def _checked(
             f"none of the {len(W)} frames in '{path}' has {least} visible points "
             f"that are not all on one line: nothing to train on"
         )
+    if detected is not None:
+        detected = np.where(visible[:, None], detected, np.nan).astype(np.float32)
+        enough &= enough_visible(np.isfinite(detected).all(1), layout)
     if not enough.all():
         W, visible = W[enough], visible[enough]
+        detected = detected if detected is None else detected[enough]
     _check_motion(W, visible, path)
     _check_twins(W, visible, layout, path)
     return TrainingData(
-        W, visible, layout, calibrated, path.name, int((~enough).sum()), _notes(visible, layout, guessed)
+        W, visible, layout, calibrated, path.name, int((~enough).sum()), _notes(visible, layout, guessed), detected
     )
 
 

@@ -213,6 +213,7 @@ class Seen:
         W: (N,2,P) float32 rays (x/z, y/z), with the detector's errors, of virtual cameras turned to the visible points
             as the Lifter turns them; 0 where hidden.
         visible: (N,P).
+        marked: (N,2,P) float32 the rays of all points as they truly are, NaN of those too near to that camera.
         S: (N,3,P) float32 the truth in those virtual cameras' frames, metres, centred on the mean of all points.
         confidence: (N,P), 0 where hidden.
         xy: (N,P,2) pixels, with the errors; NaN where hidden.
@@ -223,6 +224,7 @@ class Seen:
 
     W: np.ndarray
     visible: np.ndarray
+    marked: np.ndarray
     S: np.ndarray
     confidence: np.ndarray
     xy: np.ndarray
@@ -257,9 +259,11 @@ def _turned(xy, confidence, visible, truth, cameras: Cameras, level, layout) -> 
     view = centred_view(cameras.rays(xy), some, Intrinsics(1.0, 1.0, 0.0, 0.0, 0, 0))
     visible = visible & np.isfinite(view.W).all(1)
     S = (truth @ view.turn).transpose(0, 2, 1)
+    depth = S[:, 2:]
     return Seen(
         W=np.where(visible[:, None], view.W, 0).astype(np.float32),
         visible=visible,
+        marked=np.where(depth > _TOO_NEAR, S[:, :2] / np.maximum(depth, _TOO_NEAR), np.nan).astype(np.float32),
         S=(S - S.mean(2, keepdims=True)).astype(np.float32),
         confidence=np.where(visible, confidence, 0.0),
         xy=np.where(visible[..., None], xy, np.nan),
@@ -286,16 +290,19 @@ def _covered(rays: np.ndarray, views: Views, rng: np.random.Generator) -> np.nda
     return (rng.random((N, 1)) < views.obstacle) & (along > line)
 
 
+_TOO_NEAR = 0.3  # metres before the camera
+
 _BLOCK = 4096
 """Views that are made together."""
 
 
 def make(
     clips: list[tuple[str, np.ndarray]], views: Views, progress: Callable[[float], object] = lambda share: None
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The 2D arrays of the training file, and the truth (F,3,P) of the same frames.
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The 2D arrays of the training file, and those of a file of the same frames with their truth S (F,3,P).
 
-    Frames with too few visible points to be lifted are left out.
+    The trainer is given all points as they truly are in the image, W, and as the detector reports them, ``detected``;
+    what is judged is the detector's report alone.  Frames with too few visible points to be lifted are left out.
     """
     rng = np.random.default_rng(views.seed)
     joints = np.concatenate([joints[distinct_frames(joints, views.motion)] for _, joints in clips])
@@ -303,9 +310,9 @@ def make(
     for number, block in enumerate(_blocks(len(joints), views.views)):
         seen = see(human_points(other_people(joints[block], views, rng)), views, rng)
         enough = enough_visible(seen.visible, human_layout())
-        parts.append((seen.W[enough], seen.visible[enough], seen.S[enough]))
+        parts.append(tuple(array[enough] for array in (seen.W, seen.visible, seen.marked, seen.S)))
         progress(min(1.0, (number + 1) * _BLOCK / drawn))
-    W, visible, S = (np.concatenate(arrays) for arrays in zip(*parts))
+    W, visible, marked, S = (np.concatenate(arrays) for arrays in zip(*parts))
     about = {
         "source": "CMU motion capture (mocap.cs.cmu.edu)",
         "layout": human_layout().name,
@@ -315,7 +322,9 @@ def make(
         "left_out": drawn - len(W),
     }
     text = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    return {"W": W, "visible": visible, "calibrated": np.array(True), "about": text}, S
+    common = {"calibrated": np.array(True), "about": text}
+    detected = np.where(visible[:, None], W, np.float32(np.nan))
+    return {"W": marked, "detected": detected, **common}, {"W": W, "visible": visible, "S": S, **common}
 
 
 def _blocks(frames: int, times: int) -> Iterator[slice]:
@@ -339,12 +348,12 @@ def make_file(folder: Path, views: Views, path: Path, truth: Path | None = None,
     if not clips:
         raise MocapError(f"'{folder}' holds only trials that are kept for judging ({', '.join(HELD_OUT)})")
     with _bar("views", quiet) as progress:
-        arrays, S = make(clips, views, progress)
+        arrays, judged = make(clips, views, progress)
     about = {**json.loads(arrays["about"].tobytes()), **made}
     arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
     _save(path, arrays)
     if truth:
-        _save(truth, {**arrays, "S": S})
+        _save(truth, judged)
 
 
 def _digest(folder: Path) -> str:
@@ -383,11 +392,12 @@ def main() -> int:
     args = parser.parse_args()
     try:
         make_file(args.folder, views_of(Recipe.load(args.recipe, args.set)), args.output, args.truth, args.quiet)
-        arrays = read_npz(args.output, ("visible",))
+        detected = read_npz(args.output, ("detected",))["detected"]
     except (MocapError, RecipeError, OSError, NpzError) as error:
         print(f"human_data: {error}", file=sys.stderr)
         return 1
-    print(f"{args.output}: {len(arrays['visible'])} frames, {1 - arrays['visible'].mean():.0%} of the points hidden")
+    missing = np.isnan(detected[:, 0]).mean()
+    print(f"{args.output}: {len(detected)} frames, {missing:.0%} of the points not detected")
     return 0
 
 

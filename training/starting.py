@@ -20,6 +20,7 @@ from paul_ros.skeleton import Layout
 from training.data import TrainingData
 from training.distributed import from_first
 from training.networks import to_centre, to_unit_size
+from training.objective import Views
 from training.recipe import Recipe
 
 START = "start.npz"
@@ -29,6 +30,9 @@ START_UNIT = {"free": 0.5**0.5, "unit": 1.0}
 
 Progress = Callable[[float], None]
 """Is told the share of the work that is done, 0 to 1."""
+
+
+_NEAREST = 0.2  # of the distance of an object: its points are not nearer, while shapes are still wild
 
 
 class StartError(RuntimeError):
@@ -135,20 +139,36 @@ class Lesson:
         shapes: (n,3,P) float32 in one canonical frame, of any scale.
         rotations: (n,3,3) float32, the cameras that saw them.
         rows: (n,) the frames' numbers.
+        sizes: (n,1,1) units of the frames' images per unit of the shapes.
+        perspective: the images are rays of pinhole cameras, so that sizes are inverse distances.
+        scale: the recipe's.
     """
 
-    def __init__(self, shapes: Tensor, rotations: Tensor, rows: Tensor, layout: Layout, scale: str) -> None:
+    def __init__(
+        self,
+        shapes: Tensor,
+        rotations: Tensor,
+        rows: Tensor,
+        sizes: Tensor,
+        perspective: bool,
+        layout: Layout,
+        scale: str,
+    ) -> None:
         self._shapes = to_unit_size(shapes, layout) if scale == "free" else to_centre(shapes, layout)
-        self._cameras = rotations[:, :2]
+        self._cameras = rotations
+        before, after = (S.flatten(1).norm(dim=1)[:, None, None] for S in (to_centre(shapes, layout), self._shapes))
+        self._sizes = sizes * before / after
+        self._nearness = self._sizes if perspective else torch.zeros_like(self._sizes)
         self._symmetry = torch.from_numpy(symmetry(shapes.cpu().numpy(), layout)).to(shapes)
         self._mirror = list(layout.mirror)
         self.rows = rows
 
     @classmethod
-    def of(cls, start: Start, layout: Layout, scale: str, device: torch.device) -> Lesson:
-        """What a start teaches."""
-        shapes, rotations = (torch.from_numpy(array).to(device) for array in (start.shapes, start.rotations))
-        return cls(shapes, rotations, torch.from_numpy(start.rows), layout, scale)
+    def of(cls, start: Start, views: Views, layout: Layout, scale: str) -> Lesson:
+        """What a start teaches; views: its own frames'."""
+        shapes, rotations = (torch.from_numpy(array).to(views.W) for array in (start.shapes, start.rotations))
+        sizes = START_UNIT[scale] * views.size
+        return cls(shapes, rotations, torch.from_numpy(start.rows), sizes, views.calibrated, layout, scale)
 
     def shapes_of(self, chosen: Tensor, exchanged: Tensor | None) -> Tensor:
         """Shapes (N,3,P) by their places in the lesson (N,), mirrored where left and right are exchanged (N,1,1)."""
@@ -156,8 +176,10 @@ class Lesson:
         return S if exchanged is None else torch.where(exchanged, self._symmetry @ S[:, :, self._mirror], S)
 
     def seen_by(self, cameras: Tensor, S: Tensor) -> Tensor:
-        """Orthographic views (N,2,P) of shapes S (N,3,P) by the cameras of other frames, by places in the lesson (N,).
+        """Image points (N,2,P) of shapes S (N,3,P) for the cameras of other frames, by places in the lesson (N,).
 
-        An exact augmentation: the shape is the same from wherever it is seen, and cameras are those that do occur.
+        The shape is the same from wherever it is seen, and cameras and distances are those that do occur.
         """
-        return self._cameras[cameras.to(S.device)] @ S
+        cameras = cameras.to(S.device)
+        X, sizes, nearness = self._cameras[cameras] @ S, self._sizes[cameras], self._nearness[cameras]
+        return sizes * X[:, :2] / (1 + nearness * X[:, 2:]).clamp_min(_NEAREST)

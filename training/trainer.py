@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,8 @@ LOG_COLUMNS = (
 REGRESSION, UNSUPERVISED, HELD = "regression", "unsupervised", "held"
 _HELD_BATCH = 1000  # frames whose lower level is solved at once
 _LEFT_OUT = 0.1  # of the frames: the least explained, which do not teach the next generation
+_FAR = 1 / 3  # of the frames: those that starts are searched for in where there is perspective
+_AS_MARKED = 0.3  # of a batch of held solutions: views without the detector's errors, as the lower level sees them
 _AXES_VIEWS = 1000  # evenly chosen frames that main axes are found from
 _LOG_EVERY = 100
 _CHECKPOINT_SECONDS = 30.0
@@ -105,6 +108,7 @@ class Trainer:
             raise TrainingError(f"{processes()} processes cannot share a batch of fewer frames: start fewer")
         self._W = torch.from_numpy(data.W).to(self.device)
         self._visible = torch.from_numpy(data.visible).to(self.device)
+        self._detected = None if data.detected is None else torch.from_numpy(data.detected).to(self.device)
         self._mirror = torch.tensor(data.layout.mirror, device=self.device)
         self.generator = torch.Generator().manual_seed(recipe.seed)
         self.step, self.seconds, self.rows = 0, 0.0, []
@@ -216,7 +220,8 @@ class Trainer:
         if self.step == 0:
             self.seconds = start.seconds
         if self.regression_steps:
-            self._lesson = Lesson.of(self.start, self.data.layout, self.recipe.scale, self.device)
+            views = self.views(torch.from_numpy(self.start.rows))
+            self._lesson = Lesson.of(self.start, views, self.data.layout, self.recipe.scale)
 
     def run(self) -> Iterator[dict[str, float | str]]:
         """Train to the recipe's last step, yielding the log row of every step's progress.
@@ -280,7 +285,12 @@ class Trainer:
     def _search(self, progress: Progress | None) -> Start:
         views = self.views(torch.arange(len(self.data.W)))
         W, visible = views.W.cpu().numpy() / START_UNIT[self.recipe.scale], views.visible.cpu().numpy()
-        return starting.search(self.recipe.start, W, visible, self.recipe.seed, progress)
+        if not views.calibrated:
+            return starting.search(self.recipe.start, W, visible, self.recipe.seed, progress)
+        # Starts know no perspective, of which the small images have least.
+        far = views.size.flatten().argsort().cpu().numpy()[: max(1, round(_FAR * len(W)))]
+        found = starting.search(self.recipe.start, W[far], visible[far], self.recipe.seed, progress)
+        return replace(found, rows=far[found.rows])
 
     def _optimizer(self) -> torch.optim.Optimizer:
         """Adam on what this recipe trains, free codes at a rate of their own."""
@@ -351,16 +361,17 @@ class Trainer:
 
         Where it is for the next generation to begin with, the frames that are explained worst are left out.
         """
-        shapes, cameras, errors = [], [], []
+        parts = []
         for rows in torch.arange(len(self.data.W)).split(_HELD_BATCH):
-            found = fit(self.networks, self.recipe, self.views(rows), rows.to(self.device))
-            shapes.append(found.camera.R.mT @ found.points)
-            cameras.append(found.camera.R)
-            errors.append((found.streams.mean(0) - found.points).flatten(1).norm(dim=1))
+            views = self.views(rows)
+            found = fit(self.networks, self.recipe, views, rows.to(self.device))
+            error = (found.streams.mean(0) - found.points).flatten(1).norm(dim=1)
+            parts.append((found.camera.R.mT @ found.points, found.camera.R, views.size, error))
+        shapes, cameras, sizes, errors = map(torch.cat, zip(*parts))
         left_out = int(_LEFT_OUT * len(self.data.W)) if phase == REGRESSION else 0
-        rows = torch.cat(errors).argsort()[: len(self.data.W) - left_out].sort().values
-        shapes, cameras = torch.cat(shapes)[rows], torch.cat(cameras)[rows]
-        return Lesson(shapes, cameras, rows.cpu(), self.data.layout, self.recipe.scale)
+        rows = errors.argsort()[: len(self.data.W) - left_out].sort().values
+        perspective, layout = views.calibrated, self.data.layout
+        return Lesson(shapes[rows], cameras[rows], rows.cpu(), sizes[rows], perspective, layout, self.recipe.scale)
 
     def _held_again(self) -> Lesson:
         """The lesson of an interrupted run, from the weights that made it."""
@@ -432,8 +443,8 @@ class Trainer:
         goal = None if phase == UNSUPERVISED else self._lesson.shapes_of(chosen, exchanged)
         if recipe.hold:
             others = torch.randint(pool, (size,), generator=self.generator)
-            W = self.data.image_unit * self._lesson.seen_by(others, goal)
-            visible = self._visible.index_select(0, self._lesson.rows[others].to(self.device))
+            seen = self._lesson.rows[others].to(self.device)
+            W, visible = self._detected_as(seen, self._lesson.seen_by(others, goal))
         if recipe.hide:
             fewer = visible & (self._uniform(size, visible.shape[1]) >= recipe.hide * self._uniform(size, 1))
             visible = torch.where(enough_visible(fewer, self.data.layout)[:, None], fewer, visible)
@@ -444,6 +455,16 @@ class Trainer:
         share = share_of(size)
         goal = None if goal is None else goal[share.part]
         return self._seen(W, visible, facing)[share.part], rows[share.part], goal, share
+
+    def _detected_as(self, rows: Tensor, W: Tensor) -> tuple[Tensor, Tensor]:
+        """Views W (N,2,P) as points were hidden in frames of these numbers (N,), with the detector's errors there."""
+        visible = self._visible.index_select(0, rows)
+        if self._detected is None:
+            return W, visible
+        error = self._detected.index_select(0, rows) - self._W.index_select(0, rows)
+        marked = self._uniform(len(rows), 1) < _AS_MARKED
+        visible = torch.where(marked, visible, error.isfinite().all(1))
+        return W + torch.where(marked[..., None], 0.0, error.nan_to_num(0.0)), visible
 
     def _turns(self, size: int) -> tuple[Tensor, Tensor]:
         """Random in-plane turns (N,2,2), half of them mirrored in x where the recipe says so; (N,1,1) is -1 for those.
