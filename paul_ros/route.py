@@ -60,7 +60,7 @@ class Route:
         return replace(keypoints, xy=xy, confidence=confidence, visible=visible)
 
     def lifted_out(self, lifted: Lifted) -> Lifted:
-        """Of the model's layout -> of the output's; the root stays the model's."""
+        """Of the model's layout -> of the output's; root and `used` stay the model's."""
         return replace(lifted, points=map_points(self.out, lifted.points))
 
     def points_out(self, points: np.ndarray) -> np.ndarray:
