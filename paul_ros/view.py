@@ -141,7 +141,7 @@ def _choose(bag: Path, topics: Topics, start: float, seconds: float | None) -> _
     if not len(wanted):
         return None
     first, last = since[wanted[0]], since[wanted[-1]]
-    step = max(1 / PICTURES_PER_SECOND, (last - first) / MOST_PICTURES)
+    step = max(1 / PICTURES_PER_SECOND, (last - first) / (MOST_PICTURES - 1))
     # Rounded, so that a camera's jitter makes no step a frame longer.
     slots = np.round((since[wanted] - first) / step, 2).astype(int)
     chosen = times[wanted[np.unique(slots, return_index=True)[1]]]

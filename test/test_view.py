@@ -85,8 +85,8 @@ def test_a_long_bag_is_shown_in_larger_steps(tmp_path, model_file, drawn, monkey
     monkeypatch.setattr(view, "MOST_PICTURES", 5)
     bag = make_bag(tmp_path / "long.mcap", 61)
     film, _ = view.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
-    assert film.pictures == len(drawn) == 6
-    assert film.said == "6 pictures of 61 messages, 0.0 to 2.0 s of 2.0 s, 4.0 times as fast as in life"
+    assert film.pictures == len(drawn) == 5
+    assert film.said == "5 pictures of 61 messages, 0.0 to 2.0 s of 2.0 s, 5.0 times as fast as in life"
 
 
 def test_a_part_of_a_bag(tmp_path, model_file, drawn):
