@@ -159,7 +159,7 @@ class Lifter:
             visible = visible & np.isfinite(W).all(1)
         fit = self._fit_sure(W, visible, camera is not None)
         root, units, near = list(self.model.layout.root), self._units(camera), np.True_
-        shape = fit.R @ fit.S
+        shape = self._as_seen(fit, camera is not None)
         if units == "m":
             points = place(shape + fit.T[:, :, None], turn, self.metres_per_unit)
             near = (np.abs(points) <= MAX_DISTANCE).all((1, 2))
@@ -187,6 +187,21 @@ class Lifter:
         why = np.where(~enough, TOO_FEW_POINTS, np.where(~fixed, DEGENERATE_POINTS, TOO_FAR))[~done]
         nothing = _nothing(len(why), visible.shape[1], units)
         return _replaced(lifted, ~done, replace(nothing, reason=tuple(why.tolist())))
+
+    def _as_seen(self, fit: _Fit, pinhole: bool) -> np.ndarray:
+        """Shapes (N,3,P) in the virtual cameras' frames, their points moved sideways to where they were seen.
+
+        S_cam of the paper's equation 4, [W; z], as far as a detector can be trusted: a point within two standard
+        deviations of the model's own misfit is taken where it is seen, one farther away moves less the farther it is.
+        """
+        shape = fit.R @ fit.S
+        if self.model.misfit is None or isinstance(self.model, RigidModel):
+            return shape
+        depth = fit.T[:, 2:] + shape[:, 2] if pinhole else fit.T[:, 2:]
+        off = fit.missed * depth[:, None]
+        square = np.maximum((off * off).sum(1, keepdims=True), 1e-300)
+        shape[:, :2] += np.minimum(1.0, (2 * self.model.misfit) ** 2 / square) * off
+        return shape
 
     def _sigma(self, root: np.ndarray, fit: _Fit, units: str) -> np.ndarray:
         if units != "m":

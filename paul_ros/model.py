@@ -71,6 +71,11 @@ class Model:
         return self.header.get("stature")
 
     @property
+    def misfit(self) -> float | None:
+        """Model units, standard deviation of x and of y of points about where the model puts them; None if unknown."""
+        return self.header.get("misfit")
+
+    @property
     def scale(self) -> str:
         """``free``: every frame is normalised by its own size; ``unit``: orthographic data of one fixed scale."""
         return self.header.get("scale", "free")
@@ -328,8 +333,9 @@ def dictionary_sizes(width: int, blocks: int, bottleneck: int) -> list[int]:
 
 def _check(header: dict, layout: Layout, arrays: dict[str, np.ndarray]) -> None:
     """Raise ValueError, TypeError or KeyError where the header is not one or the arrays are not those it speaks of."""
-    _check_metres("metres_per_unit", header["metres_per_unit"])
-    _check_metres("stature", header.get("stature"))
+    _check_length("metres_per_unit", header["metres_per_unit"])
+    _check_length("stature", header.get("stature"))
+    _check_length("misfit", header.get("misfit"))
     _check_scale(header)
     _check_architecture(header)
     expected = weight_shapes(header, len(layout.names))
@@ -341,9 +347,9 @@ def _check(header: dict, layout: Layout, arrays: dict[str, np.ndarray]) -> None:
             raise ValueError(f"array {name} is not float32 of shape {shape} and moderate size")
 
 
-def _check_metres(name: str, metres: object) -> None:
-    if metres is not None and not (type(metres) in (int, float) and 1e-6 < metres < 1e6):
-        raise ValueError(f"{name} is {metres!r}")
+def _check_length(name: str, length: object) -> None:
+    if length is not None and not (type(length) in (int, float) and 1e-6 < length < 1e6):
+        raise ValueError(f"{name} is {length!r}")
 
 
 def _check_scale(header: dict) -> None:

@@ -9,6 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from paul_ros.model import load_model
+from paul_ros.onp import onp
 from paul_ros.skeleton import anonymous_layout, load_layout
 from training import export
 from training.categories import joint_layout
@@ -57,6 +58,20 @@ def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, enco
     assert np.allclose(model.shape(turned, data.visible), S, atol=1e-4) == upright
     sizes = np.linalg.norm(model.shape(data.W, data.visible), axis=(1, 2))
     assert (np.ptp(sizes) > 1e-3) == (scale == "unit")
+
+
+def test_the_misfit_is_told_in_model_units(data, tmp_path):
+    """Of the median distance between points and where the model puts them, whatever the frames' scales."""
+    header = export_model(trained(data, tmp_path), 0.5, tmp_path / "m.npz", "paul train")
+    model = load_model(tmp_path / "m.npz")
+    assert model.misfit == header["misfit"]
+    S = model.shape(data.W, data.visible).astype(float)
+    pose = onp(S, data.W, data.visible)
+    off = (data.W - pose.translation[..., None]) / pose.scale[:, None, None] - pose.R[:, :2] @ S
+    expected = np.median(np.linalg.norm(off, axis=1)) / np.sqrt(2 * np.log(2))
+    assert model.misfit == pytest.approx(expected, rel=0.3)  # the networks' two streams have one pose together
+    scaled = export_model(trained(data, tmp_path / "unit", scale="unit"), 0.5, tmp_path / "u.npz", "paul train")
+    assert "misfit" not in scaled
 
 
 def test_weights_come_from_whatever_device_they_are_on():

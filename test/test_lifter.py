@@ -235,3 +235,52 @@ def test_the_rigid_baseline_doubts_no_detector(rigid_lifter, model):
     xy = pinhole(standing(model, [0, 0, 4]))
     xy[0, 9] += (50, 30)
     assert rigid_lifter.lift(xy, np.ones((1, 17), bool), CAMERA).used.all()
+
+
+def with_misfit(model, misfit):
+    return replace(model, header={**model.header, "misfit": misfit})
+
+
+def bent(offset=0.03):
+    """PERSON 4 m away with every point a little out of place, (1,17,3) metres."""
+    return persons_at((0.3, 0, 4)) + offset * np.random.default_rng(0).standard_normal((1, 17, 3))
+
+
+def test_points_are_where_they_are_seen_if_the_model_is_trusted_less(model):
+    """S_cam of the paper: with a large misfit every visible point projects to its pixel; hidden ones stay."""
+    truth = bent()
+    visible = everything(truth)
+    visible[:, 3] = False
+    by_model, as_seen = (Lifter(with_misfit(model, size)).lift(pinhole(truth), visible, CAMERA) for size in (None, 100))
+    np.testing.assert_allclose(pinhole(as_seen.points)[visible], pinhole(truth)[visible], atol=1e-6)
+    assert np.abs(pinhole(by_model.points) - pinhole(truth))[visible].max() > 1
+    np.testing.assert_array_equal(as_seen.reprojection, by_model.reprojection)  # the model's own, which tells doubt
+    np.testing.assert_allclose(as_seen.points[:, 3], by_model.points[:, 3], atol=1e-9)
+
+
+def test_without_intrinsics_points_are_where_they_are_seen_too(model):
+    """Under weak perspective: in the image plane, of one scale."""
+    truth = bent()
+    lifted = Lifter(with_misfit(model, 100.0)).lift(pinhole(truth), everything(truth))
+    seen = pinhole(truth) - pinhole(truth)[:, [11, 12]].mean(1, keepdims=True)
+    np.testing.assert_allclose(lifted.points[..., :2] * lifted.scale, seen, atol=1e-6)
+
+
+def test_a_point_seen_far_from_where_the_model_puts_it_moves_less(model):
+    """Beyond two standard deviations, by the square of the two over the distance."""
+    xy, visible = pinhole(bent()), everything(bent())
+    exact, lifted = (Lifter(with_misfit(model, size)).lift(xy, visible, CAMERA).points[0] for size in (100.0, None))
+    virtual = centred_view(xy, visible, CAMERA).turn[0]
+    off = np.linalg.norm(((exact - lifted) @ virtual)[:, :2], axis=1)
+    limit = np.median(off)
+    some = Lifter(with_misfit(model, limit / 2 / model.metres_per_unit)).lift(xy, visible, CAMERA).points[0]
+    share = np.linalg.norm(some - lifted, axis=1) / off
+    np.testing.assert_allclose(share, np.minimum(1, (limit / off) ** 2), rtol=1e-6)
+
+
+def test_the_rigid_baseline_is_not_moved(model):
+    truth = bent()
+    a, b = (
+        Lifter(with_misfit(model, size).rigid()).lift(pinhole(truth), everything(truth), CAMERA) for size in (None, 1)
+    )
+    np.testing.assert_array_equal(a.points, b.points)

@@ -30,7 +30,7 @@ CHOICES = {
 }
 _POSITIVE = ("bottleneck", "width", "blocks", "learning_rate", "code_learning_rate", "restarts", "generations")
 _NOT_NEGATIVE = (
-    *("steps", "regression_steps", "hold", "batch", "patience", "roll"),
+    *("steps", "regression_steps", "hold", "batch", "patience", "roll", "stature"),
     *("code_weight", "decay_weight", "nuclear_weight", "handedness_weight", "bone_weight"),
 )
 
@@ -83,6 +83,7 @@ class Recipe:
     mirror_object: bool = False  # left and right exchanged: only for objects that are symmetric
     hide: float = 0.0  # up to this share of a frame's points is hidden anew at every step
     known_lengths: tuple[tuple[str, str, float], ...] = ()  # (point, point, metres): sets the metres per model unit
+    stature: float = 0.0  # metres, of the people who have these lengths; 0: no people
     views: Views | None = None  # how people are seen, where the data is a folder of motion capture (view_settings.py)
 
     @classmethod
