@@ -42,10 +42,10 @@ def lacking() -> str:
     return f"a C and C++ compiler ({', '.join(missing)})" if missing else ""
 
 
-def build(package: str, folder: Path) -> None:
+def build(package: str, folder: Path, definitions: dict[str, str] = DEFINITIONS) -> None:
     """Puts the importable package and its libraries into `folder`; raises CalledProcessError if it does not compile."""
     work = folder / f"{package}_build"
-    python, *others = generate(package, work)
+    python, *others = generate(package, work, definitions)
     sources = [file for part in (python, *others) for file in sorted(part.rglob("*.c*"))]
     with ThreadPoolExecutor(2) as pool:
         objects = dict(zip(sources, pool.map(lambda source: _compile(source, work), sources)))
@@ -66,7 +66,7 @@ def _link(out: Path, parts: list[Path]) -> None:
     _run("c++", "-shared", "-Wl,--no-as-needed", f"-Wl,-soname,{out.name}", "-o", out, *parts, *paths, *libraries)
 
 
-def generate(package: str, work: Path) -> list[Path]:
+def generate(package: str, work: Path, definitions: dict[str, str]) -> list[Path]:
     """Makes every source of the package; the folders of the Python part and of the C part."""
     from rosidl_adapter.msg import convert_msg_to_idl
     from rosidl_generator_c import generate_c
@@ -76,10 +76,10 @@ def generate(package: str, work: Path) -> list[Path]:
     from rosidl_typesupport_fastrtps_c import generate_typesupport_fastrtps_c
     from rosidl_typesupport_introspection_c import generate_c as generate_introspection
 
-    names = [name.split("/")[2] for name in DEFINITIONS if name.startswith(f"{package}/")]
+    names = [name.split("/")[2] for name in definitions if name.startswith(f"{package}/")]
     (work / "msg").mkdir(parents=True)
     for name in names:
-        (work / f"msg/{name}.msg").write_text(DEFINITIONS[f"{package}/msg/{name}"])
+        (work / f"msg/{name}.msg").write_text(definitions[f"{package}/msg/{name}"])
         convert_msg_to_idl(work, package, Path(f"msg/{name}.msg"), work / "msg")
 
     def arguments(output: Path, generator: str = "") -> str:
