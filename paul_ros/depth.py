@@ -27,6 +27,7 @@ SIZES = (0.4, 1.4)
 
 _WINDOW = 0.04  # metres, half the side of the window
 _NEAR = 20_000_000  # ns between the stamps of an image and its depths
+_SET_BACK = 10**9  # ns
 _KEPT = 15  # images, half a second at 30 Hz: so far behind may a detector be
 
 
@@ -37,7 +38,9 @@ class Depths:
         self._images: deque[DepthImage] = deque(maxlen=_KEPT)
 
     def add(self, image: DepthImage) -> None:
-        """One more."""
+        """One more; where it is a second and more older than the last, the clock was set back, and all start anew."""
+        if self._images and image.stamp < self._images[-1].stamp - _SET_BACK:
+            self._images.clear()
         self._images.append(image)
 
     def place(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ROS 2 node `lifter`: a thin shell over LiftStream. The only place that imports rclpy.
+"""The ROS 2 node `lifter`: a thin, managed shell over LiftStream.
 
 Subscribes `keypoints` (2D), `camera_info` and `depth` (optional); publishes ~/poses, ~/bodies, ~/keypoints3d,
 ~/markers, ~/layout and /diagnostics. Headers are the input's own.
@@ -14,9 +14,7 @@ for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"
 
 import argparse
-import array
 import functools
-import importlib
 import json
 import re
 import signal
@@ -25,191 +23,328 @@ import threading
 import time
 from collections import Counter
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.clock import Clock, ClockType
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 
 import msg_adapters
+from paul_ros.health import Aloud, Health, Report, listed, percentiles, unscaled
+from paul_ros.inputs import KeypointInput
 from paul_ros.model import ModelError
-from paul_ros.parameters import LIVE, PARAMETERS, Parameter, as_markdown
+from paul_ros.parameters import LIVE, PARAMETERS, as_markdown
+from paul_ros.ros import (
+    OVERRIDES,
+    RosMake,
+    descriptor,
+    input_qos,
+    latched_qos,
+    message_class,
+    output_qos,
+    unheard,
+    unhearing,
+)
 from paul_ros.skeleton import LayoutError
 from paul_ros.stream import OUTPUTS, Frame, LiftStream, open_stream
 
-#: Matches every publisher; a few frames deep, so that a hiccup of the scheduler loses none.
-_INPUT_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-_OUTPUT_QOS = QoSProfile(depth=10)
-_LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_LOOK_SECONDS = 0.2
+_LOOK_SECONDS = 0.05
+_REPORT_SECONDS = 1.0
+#: Without keypoints, before a warning.
+_SILENT_SECONDS = 5.0
 #: Detectors that send a message a person send those of one image in one go: two such silences tell that they are all.
 _SILENCE_SECONDS = 0.005
-_WARN_SECONDS = 5.0
+#: Model units are worth a warning so often: who has no CameraInfo knows it.
+_UNITS_SECONDS = 60.0
 #: An idle node looks this often whether a signal asked it to end.
 _STOP_SECONDS = 0.2
+#: Parameters that take another stream.
+_SWITCHING = ("model", "layout", "output_layout")
+#: What parameters may be refused with. rclpy has no common class for its errors, but most are RuntimeErrors.
+_REFUSALS = (ModelError, LayoutError, ParameterException, InvalidQosOverridesError, ValueError, RuntimeError)
 
 
-@functools.cache
-def message_class(type_name: str) -> type:
-    """The class of 'package/msg/Name'; raises ImportError where its package is not installed."""
-    package, _, name = type_name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), name)
-    except AttributeError:
-        raise ImportError(f"{package} has no message {name}") from None
+def _transition(callback):
+    """Says aloud what goes wrong in a transition: rclpy swallows it."""
+
+    @functools.wraps(callback)
+    def guarded(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return callback(self, state)
+        except Exception as error:
+            self.get_logger().error(f"{callback.__name__.removeprefix('on_')}: {type(error).__name__}: {error}")
+            return TransitionCallbackReturn.ERROR
+
+    return guarded
 
 
-class RosMake:
-    """The factory of msg_adapters.outputs for rclpy's message classes."""
+class LifterNode(LifecycleNode):
+    """Subscribes, hands messages to the stream, publishes what comes back, and says aloud what is wrong.
 
-    def __call__(self, type_name: str, **fields):
-        return message_class(type_name)(**fields)
+    A managed node (design.ros2.org, Managed nodes). Configured, it has its model and its publishers; while it is
+    active, and only then, it has subscriptions, publishes and counts.
 
-    @staticmethod
-    def octets(data: bytes) -> array.array:
-        return array.array("B", data)
-
-
-class LifterNode(Node):
-    """Subscribes, hands messages to the stream, publishes what comes back, and says aloud what is wrong."""
+    stream: None unless it is configured.
+    """
 
     def __init__(self) -> None:
-        """Raises ModelError or LayoutError where the parameters name something that cannot be used."""
+        """Raises what parameters are refused with, where one has a value that no parameter of its kind may have."""
         super().__init__("lifter")
         self._make = RosMake()
-        # Discovery and the first frames take their time: silence is worth a warning only after a while.
-        self._warned = {"no input": time.monotonic(), "silent": time.monotonic()}
-        self._reported: Counter = Counter()
-        self._described: dict = {}
-        self._topic = self.resolve_topic_name("keypoints")
-        self._input_type: str | None = None
-        self._seen: Counter = Counter()
-        self._last_number = 0
-        values = self._declare_parameters()
-        self.stream = self._open_stream(values)
-        self._told = self.stream.route
-        self.add_on_set_parameters_callback(self._take_parameters)
-        self._outputs = {
-            name: self.create_publisher(message_class(type_name), f"~/{name}", _OUTPUT_QOS)
-            for name, type_name in OUTPUTS.items()
+        self._warn = Aloud(self.get_logger().warning)
+        # Not ROS time: a simulation that stands still would hold the last image back, and diagnostics too.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._values = {
+            parameter.name: self.declare_parameter(parameter.name, parameter.default, descriptor(parameter)).value
+            for parameter in PARAMETERS
         }
-        self._layout = self.create_publisher(String, "~/layout", _LATCHED_QOS)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", _OUTPUT_QOS)
-        self.create_subscription(CameraInfo, "camera_info", self._on_camera_info, _INPUT_QOS)
-        self.create_subscription(Image, "depth", self._on_depth, _INPUT_QOS)
-        self._publish_layout()
-        self._look_timer = self.create_timer(_LOOK_SECONDS, self._look_for_input)
-        # Steady: a simulation that stands still would hold the last image back.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._silence_timer = self.create_timer(_SILENCE_SECONDS, self._on_silence, clock=steady, autostart=False)
-        self._silences = 0
-        self.create_timer(1.0, self._publish_diagnostics)
+        self.stream: LiftStream | None = None
+        self._input: KeypointInput | None = None
+        self._refusal: Exception | None = None
+        self._starting = False
+        self._ended = "nothing was lifted"
+        self._outputs: dict = {}
+        self._subscribed: list = []
+        self._timers_on: list = []
+        self.add_on_set_parameters_callback(self._take_parameters)
+        back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
+        self._jumps = self.get_clock().create_jump_callback(back, post_callback=self._on_jump)
+
+    @property
+    def active(self) -> bool:
+        """Whether it lifts."""
+        return bool(self._timers_on)
+
+    def start(self) -> None:
+        """Configures and activates; raises what was refused."""
+        self._starting = True
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != TransitionCallbackReturn.SUCCESS:
+                raise self._refusal or RuntimeError("the node could not be started, see the log")
+        self._starting = False
+
+    def end(self) -> None:
+        """The transition to the last state; what it holds is published before."""
+        if self._state_machine.current_state[1] != "finalized":
+            self.trigger_shutdown()
 
     def summary(self) -> str:
         """What was done, in one line."""
-        counts = self.stream.counts
-        median, p99 = _microseconds(self.stream.lift_us)
-        return (
-            f"lifter: {counts['frames']} frames, {counts['lifted']} of {counts['persons']} persons "
-            f"lifted, median {median:.0f} µs, p99 {p99:.0f} µs a frame; "
-            f"dropped: {_listed(self.stream.drops)}"
+        return f"lifter: {self._summed(self.stream) if self.stream else self._ended}"
+
+    # --- transitions
+
+    @_transition
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Loads the model and makes the publishers; what it cannot use it refuses, and may be asked again."""
+        try:
+            self._configure()
+        except _REFUSALS as error:
+            self._clean()
+            return self._refuse(error)
+        return TransitionCallbackReturn.SUCCESS
+
+    @_transition
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribes and publishes from now on."""
+        super().on_activate(state)
+        try:
+            self._activate()
+        except _REFUSALS as error:
+            self._deactivate()
+            super().on_deactivate(state)
+            return self._refuse(error)
+        return TransitionCallbackReturn.SUCCESS
+
+    @_transition
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Publishes what it holds, then neither listens nor publishes."""
+        self._deactivate()
+        return super().on_deactivate(state)
+
+    @_transition
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forgets the model and all that was counted."""
+        self._clean()
+        return TransitionCallbackReturn.SUCCESS
+
+    @_transition
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """From any state."""
+        self._deactivate()
+        self._clean()
+        return TransitionCallbackReturn.SUCCESS
+
+    @_transition
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Back to unconfigured, whatever went wrong."""
+        return self.on_shutdown(state)
+
+    def _configure(self) -> None:
+        self.stream = open_stream(**self._values)
+        self._input = KeypointInput(
+            self,
+            "keypoints",
+            self._values["input_type"],
+            self._on_keypoints,
+            lambda: self.stream.max_persons,
+            self._warn,
+            self._on_mismatch,
+        )
+        self._health = Health(time.monotonic())
+        self._told, self._described, self._reported = self.stream.route, {}, Counter()
+        self._outputs = {
+            name: self._publisher(message_class(type_name), f"~/{name}") for name, type_name in OUTPUTS.items()
+        }
+        self._layout = self._publisher(String, "~/layout", latched_qos())
+        self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics")
+
+    def _activate(self) -> None:
+        self._health = Health(time.monotonic())
+        # Discovery takes its time: that nobody publishes is worth a warning only after a while.
+        self._warn.hold("no input")
+        self._silences, self._described = 0, {}
+        self._subscribed = [
+            self._subscription(CameraInfo, "camera_info", self._on_camera_info),
+            self._subscription(Image, "depth", self._on_depth),
+        ]
+        self._silence = self.create_timer(_SILENCE_SECONDS, self._on_silence, clock=self._steady, autostart=False)
+        self._looking = self.create_timer(_LOOK_SECONDS, self._look, clock=self._steady)
+        report = self.create_timer(_REPORT_SECONDS, self._report, clock=self._steady)
+        self._timers_on = [self._silence, self._looking, report]
+        self._publish_layout()
+        self._look()
+
+    def _deactivate(self) -> None:
+        if self.active:
+            self.flush()
+        for timer in self._timers_on:
+            self.destroy_timer(timer)
+        for subscription in self._subscribed:
+            self.destroy_subscription(subscription)
+        if self._input:
+            self._input.close()
+        self._timers_on, self._subscribed = [], []
+
+    def _clean(self) -> None:
+        for publisher in list(self._managed_entities):
+            self.destroy_lifecycle_publisher(publisher)
+        if self.stream:
+            self._ended = self._summed(self.stream)
+        self.stream, self._input, self._outputs = None, None, {}
+
+    def _refuse(self, error: Exception) -> TransitionCallbackReturn:
+        self._refusal = error
+        if not self._starting:
+            self.get_logger().error(one_line(error))
+        return TransitionCallbackReturn.FAILURE
+
+    def _publisher(self, kind: type, topic: str, qos=None):
+        resolved = self.resolve_topic_name(topic)
+        return self.create_lifecycle_publisher(
+            kind,
+            topic,
+            qos or output_qos(),
+            qos_overriding_options=OVERRIDES,
+            event_callbacks=unhearing(resolved, self._on_mismatch),
+        )
+
+    def _subscription(self, kind: type, topic: str, callback):
+        resolved = self.resolve_topic_name(topic)
+        return self.create_subscription(
+            kind,
+            topic,
+            callback,
+            input_qos(),
+            qos_overriding_options=OVERRIDES,
+            event_callbacks=unheard(resolved, self._on_mismatch),
         )
 
     # --- parameters
 
-    def _declare_parameters(self) -> dict:
-        return {
-            parameter.name: self.declare_parameter(parameter.name, parameter.default, _descriptor(parameter)).value
-            for parameter in PARAMETERS
-        }
-
-    def _open_stream(self, values: dict) -> LiftStream:
-        self._wanted_type = values["input_type"]
-        if self._wanted_type != "auto" and self._wanted_type not in msg_adapters.SUPPORTED:
-            raise ValueError(
-                f"input_type is {self._wanted_type}; it must be auto or one of {', '.join(msg_adapters.SUPPORTED)}"
-            )
-        return open_stream(**values)
-
     def _take_parameters(self, parameters) -> SetParametersResult:
-        """Sets those that may change; one that the model cannot have is refused with the reason."""
+        """All of them or none; one that the node cannot have is refused with the reason, and all stays as it was."""
+        given = {parameter.name: parameter.value for parameter in parameters if parameter.name in LIVE}
+        values = {**self._values, **given}
         try:
-            for parameter in parameters:
-                if parameter.name in LIVE:
-                    setattr(self.stream, parameter.name, parameter.value)
-        except ModelError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        self._publish_layout()
+            # Before the model is loaded nothing tells whether it can be; configuring does.
+            if self.stream and given:
+                self._apply(given, values)
+        except _REFUSALS as error:
+            return SetParametersResult(successful=False, reason=one_line(error))
+        self._values = values
         return SetParametersResult(successful=True)
 
-    # --- topics
+    def _apply(self, given: dict, values: dict) -> None:
+        if any(name in given for name in _SWITCHING):
+            self._switch(open_stream(**values))
+        # In the order of the table: person_height is the only one that the model may refuse, and the first.
+        for name in LIVE:
+            if name in given and name not in _SWITCHING:
+                setattr(self.stream, name, given[name])
+        if self.active:
+            self._publish_layout()
 
-    def _look_for_input(self) -> None:
-        """Subscribes as soon as the type of the input is known; until then says aloud what is missing."""
-        topic, types = self._topic, [self._wanted_type]
-        if self._wanted_type == "auto":
-            types = sorted({info.topic_type for info in self.get_publishers_info_by_topic(topic)})
-        readable = [name for name in types if name in msg_adapters.SUPPORTED]
-        if not types:
-            self._warn("no input", f"nobody publishes {topic} yet; remap `keypoints` to your detector")
-        elif not readable:
-            self._warn(
-                "unknown type",
-                f"{topic} has the type {', '.join(types)}, which cannot be read; "
-                f"readable are {', '.join(msg_adapters.SUPPORTED)}",
-            )
-        else:
-            self._subscribe_keypoints(readable[0])
+    def _switch(self, stream: LiftStream) -> None:
+        """From now on by this stream; what waits for the rest of its image is lifted by the old one."""
+        if self.active:
+            self.flush()
+        stream.take_over(self.stream)
+        self.stream, self._told = stream, stream.route
+        model = stream.lifter.model
+        self.get_logger().info(f"lifting with model {model.name} ({model.sha256[:12]})")
 
-    def _subscribe_keypoints(self, type_name: str) -> None:
-        try:
-            kind = message_class(type_name)
-        except ImportError as error:
-            self._warn(
-                "no package",
-                f"{self._topic} has the type {type_name}, whose package cannot be "
-                f"imported ({error}); install it or source its workspace",
-            )
-            return
-        self.create_subscription(kind, self._topic, self._on_keypoints, _INPUT_QOS)
-        self._input_type = type_name
-        self._look_timer.cancel()
-        self.get_logger().info(f"reading {type_name} from {self._topic}")
+    # --- what comes in
 
-    # --- messages
+    def _look(self) -> None:
+        if self._input.look():
+            self._looking.cancel()
 
     def _on_camera_info(self, msg: CameraInfo) -> None:
         self.stream.camera_info(msg)
         self._report_drops()
-        if self.stream.notes["distorted_image"] and "distorted_image" not in self._warned:
-            self._warn("distorted_image", self.stream.explanations["distorted_image"])
+        if self.stream.notes["distorted_image"]:
+            self._warn("distorted_image", self.stream.explanations["distorted_image"], every=_UNITS_SECONDS)
         self._publish_layout()
 
     def _on_depth(self, msg: Image) -> None:
         self.stream.depth(msg)
         self._report_drops()
 
-    def _on_keypoints(self, msg, info: dict) -> None:
-        self._count_missed(info["publication_sequence_number"])
-        self._take(self.stream.keypoints(self._input_type, msg, self._topic))
-        if self._input_type in msg_adapters.ONE_PERSON:
+    def _on_keypoints(self, type_name: str, msg, topic: str, missed: int) -> None:
+        self._health.came(time.monotonic())
+        if missed:
+            self.stream.drops["missed"] += missed
+            self.stream.explanations["missed"] = "Lost on the way, or newer came before they could be lifted"
+        self._take(self.stream.keypoints(type_name, msg, topic))
+        if type_name in msg_adapters.ONE_PERSON:
             self._silences = 0
-            self._silence_timer.reset()
+            self._silence.reset()
 
     def _on_silence(self) -> None:
         """Flushes at the second tick: at the first, if this process was kept from running, a message may be waiting."""
         self._silences += 1
         if self._silences == 2:
-            self._silence_timer.cancel()
+            self._silence.cancel()
             self.flush()
+
+    def _on_jump(self, jump) -> None:
+        """Simulated time was set back, as by a bag that loops."""
+        if self.active:
+            self.flush()
+            self._health.forget_latency()
+            self.stream.notes["clock_set_back"] += 1
+            self._warn("clock_set_back", f"time was set back by {-jump.delta.nanoseconds / 1e9:.1f} s")
+
+    # --- what goes out
 
     def flush(self) -> None:
         """Lifts and publishes the persons that the stream keeps for more of their image."""
@@ -221,18 +356,8 @@ class LifterNode(Node):
                 self._tell_layouts()
             with self.stream.guard():
                 self._publish(frame)
+                self._health.went(frame, self._now())
         self._report_drops()
-
-    def _count_missed(self, number: int) -> None:
-        """Counts what was published and got lost, or was replaced by newer while this node was busy.
-
-        Of several publishers the numbers cannot be told apart; then nothing is counted.
-        """
-        missed = number - self._last_number - 1 if self._last_number else 0
-        self._last_number = number
-        if missed > 0 and self.count_publishers(self._topic) == 1:
-            self.stream.drops["missed"] += missed
-            self.stream.explanations["missed"] = "Lost on the way, or newer came before they could be lifted"
 
     def _publish(self, frame: Frame) -> None:
         """Builds what somebody listens to and then publishes it, so that a fault leaves no half frame."""
@@ -244,12 +369,17 @@ class LifterNode(Node):
         for publisher, message in built:
             publisher.publish(message)
 
+    def _now(self) -> int:
+        """ns by the clock that stamps are of; rclpy's own call takes ten times as long where it is the system's."""
+        clock = self.get_clock()
+        return clock.now().nanoseconds if clock.ros_time_is_active else time.time_ns()
+
     def _tell_layouts(self) -> None:
         """Once, when the first message has shown which layout the detector uses, and before its frame goes out."""
         self._told = self.stream.route
         self.get_logger().info(
-            f"{self._topic} is taken to have the points of {self._told.given.name}, set the parameter `layout` if it "
-            f"has others; published are those of {self._told.output.name}"
+            f"{self._input.topic} is taken to have the points of {self._told.given.name}, set the parameter `layout` "
+            f"if it has others; published are those of {self._told.output.name}"
         )
         self._publish_layout()
 
@@ -265,12 +395,9 @@ class LifterNode(Node):
 
     # --- what is wrong, aloud
 
-    def _warn(self, key: str, text: str) -> None:
-        """Logs a warning at once, and the same one again at most every _WARN_SECONDS."""
-        now = time.monotonic()
-        if now - self._warned.get(key, -_WARN_SECONDS) >= _WARN_SECONDS:
-            self._warned[key] = now
-            self.get_logger().warning(text)
+    def _on_mismatch(self, topic: str, text: str) -> None:
+        self._health.mismatch()
+        self._warn(f"qos {topic}", text)
 
     def _report_drops(self) -> None:
         for reason, count in self.stream.drops.items():
@@ -279,74 +406,38 @@ class LifterNode(Node):
                 explanation = self.stream.explanations.get(reason, "")
                 self._warn(reason, f"dropped: {reason}, {count} so far. {explanation}")
 
-    def _publish_diagnostics(self) -> None:
-        frames = self.stream.counts["frames"] - self._seen["frames"]
-        dropped = self.stream.drops - self._seen
-        self._seen = self.stream.counts + self.stream.drops
-        status = self._status(*self._health(frames, dropped))
-        message = DiagnosticArray(status=[status])
+    def _report(self) -> None:
+        """/diagnostics (REP-107), once a second."""
+        source = self._input.type_name or "none"
+        report = self._health.report(time.monotonic(), self.stream, self._input.problem, source)
+        message = DiagnosticArray(status=[self._status(report)])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+        if report.silence and report.silence >= _SILENT_SECONDS:
+            self._warn("silent", f"no keypoints for {report.silence:.0f} s on {self._input.topic}")
         # Not before the first second is over: CameraInfo may come a little later than the keypoints.
-        if frames and self.stream.units == "model" and "units" not in self._warned:
-            self._warn("units", f"lifting in model units, not metres: {self._described['scale_source']}")
+        if report.frames and unscaled(self.stream):
+            why = self._described["scale_source"]
+            self._warn("units", f"lifting in model units, not metres: {why}", every=_UNITS_SECONDS)
 
-    def _health(self, frames: int, dropped: Counter) -> tuple[bytes, str]:
-        """Level and one line, from what came and what was dropped in the last second."""
-        if self._input_type is None:
-            return DiagnosticStatus.WARN, "no input yet"
-        if frames:
-            self._warned["silent"] = time.monotonic()
-        elif not dropped:
-            self._warn("silent", f"no keypoints for {_WARN_SECONDS:.0f} s")
-            return DiagnosticStatus.WARN, "no keypoints in the last second"
-        message = f"{frames} frames in the last second, units: {self.stream.units}"
-        if not dropped:
-            return DiagnosticStatus.OK, message
-        level = DiagnosticStatus.ERROR if dropped["internal_error"] else DiagnosticStatus.WARN
-        return level, f"{message}; dropped: {_listed(dropped)}"
+    def _status(self, report: Report) -> DiagnosticStatus:
+        return DiagnosticStatus(
+            level=bytes([report.level]),
+            name=f"{self.get_fully_qualified_name().lstrip('/')}: lifting",
+            message=report.message,
+            hardware_id="",
+            values=[KeyValue(key=key, value=str(value)) for key, value in report.values.items()],
+        )
 
-    def _status(self, level: bytes, message: str) -> DiagnosticStatus:
-        stream = self.stream
-        median, p99 = _microseconds(stream.lift_us)
-        values = {
-            **stream.counts,
-            **_prefixed("dropped_", stream.drops),
-            **_prefixed("noted_", stream.notes),
-            "lift_us_median": f"{median:.1f}",
-            "lift_us_p99": f"{p99:.1f}",
-            "units": stream.units,
-            "input_type": self._input_type or "none",
-            "model": self._described["model"],
-            "model_sha256": self._described["model_sha256"],
-        }
-        pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        name = self.get_fully_qualified_name().lstrip("/")
-        return DiagnosticStatus(level=level, name=f"{name}: lifting", message=message, hardware_id="", values=pairs)
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=parameter.description, read_only=not parameter.live)
-    if isinstance(parameter.default, float):
-        low, high = parameter.limits
-        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
-    elif isinstance(parameter.default, int):
-        low, high = parameter.limits
-        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
-    return descriptor
-
-
-def _listed(counter: Counter) -> str:
-    return ", ".join(f"{count} {reason}" for reason, count in sorted(counter.items())) or "none"
-
-
-def _prefixed(prefix: str, counter: Counter) -> dict:
-    return {prefix + name: count for name, count in sorted(counter.items())}
-
-
-def _microseconds(times) -> tuple[float, float]:
-    """Median and 99th percentile, 0 before the first."""
-    return tuple(np.percentile(times, (50, 99)).tolist()) if times else (0.0, 0.0)
+    @staticmethod
+    def _summed(stream: LiftStream) -> str:
+        median, p99 = percentiles(stream.lift_us) or (0.0, 0.0)
+        counts = stream.counts
+        return (
+            f"{counts['frames']} frames, {counts['lifted']} of {counts['persons']} persons "
+            f"lifted, median {median:.0f} µs, p99 {p99:.0f} µs a frame; "
+            f"dropped: {listed(stream.drops)}"
+        )
 
 
 def _process_seconds() -> float:
@@ -383,7 +474,7 @@ def _join_ros(argv: list[str]) -> None:
         ) from error
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """The error's text without line breaks and the places in rcl's own source that it names."""
     return re.sub(r",? at \S+\.c(pp)?:\d+", "", " ".join(str(error).split()))
 
@@ -396,13 +487,16 @@ def main() -> int:
     try:
         _join_ros(sys.argv)
         node = LifterNode()
-    # rclpy has no common class for its errors, but most are RuntimeErrors.
-    except (ModelError, LayoutError, ParameterException, ValueError, RuntimeError) as error:
-        print(f"lifter: {_one_line(error)}", file=sys.stderr)
+        if node.get_parameter("autostart").value:
+            node.start()
+    except _REFUSALS as error:
+        print(f"lifter: {one_line(error)}", file=sys.stderr)
         rclpy.try_shutdown()
         return 1
-    node.get_logger().info(f"ready {_process_seconds():.2f} s after the process started")
+    state = "ready" if node.active else "waiting to be configured,"
+    node.get_logger().info(f"{state} {_process_seconds():.2f} s after the process started")
     _spin(node, stop)
+    node.end()
     print(node.summary(), file=sys.stderr, flush=True)
     node.destroy_node()
     rclpy.try_shutdown()
@@ -414,7 +508,6 @@ def _spin(node: LifterNode, stop: threading.Event) -> None:
     executor.add_node(node)
     while rclpy.ok() and not stop.is_set():
         executor.spin_once(timeout_sec=_STOP_SECONDS)
-    node.flush()
 
 
 if __name__ == "__main__":

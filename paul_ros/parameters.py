@@ -18,25 +18,38 @@ class Parameter:
     """One parameter. `limits`: inclusive (low, high) of a number; `live`: may change while the node runs."""
 
     name: str
-    default: str | int | float
+    default: str | int | float | bool
     description: str
     limits: tuple | None = None
     live: bool = False
 
 
 PARAMETERS = (
-    Parameter("model", "human_coco17", "Model file: the name of one that is shipped, or a path to a .npz."),
+    Parameter(
+        "autostart",
+        True,
+        "Configure and activate at once; false = wait for the transitions of a managed node, as `ros2 lifecycle` asks "
+        "for them.",
+    ),
+    Parameter(
+        "model",
+        "human_coco17",
+        "Model file: the name of one that is shipped, or a path to a .npz, which is read anew each time it is set.",
+        live=True,
+    ),
     Parameter(
         "layout",
         "",
         "Keypoint layout of the input: a name, or a path to a .yaml; empty = found from the first message that shows "
         "somebody.",
+        live=True,
     ),
     Parameter(
         "output_layout",
         "",
         "Keypoint layout of the output: a name, or a path to a .yaml, of whose points the model has all; model = all "
         "points of the model; empty = the input's, or the model's where that lacks a point of the input's.",
+        live=True,
     ),
     Parameter(
         "input_type",
@@ -96,8 +109,14 @@ def as_yaml() -> str:
 
 def as_markdown() -> str:
     """The README's table of parameters."""
-    rows = [f"| `{p.name}` | `{p.default!r}` | {_kind(p)} | {p.description} |" for p in PARAMETERS]
+    rows = [f"| `{p.name}` | `{_value(p)}` | {_kind(p)} | {p.description} |" for p in PARAMETERS]
     return "\n".join(["| parameter | default | may be set | meaning |", "|---|---|---|---|", *rows]) + "\n"
+
+
+def _value(parameter: Parameter) -> str:
+    """The default, as YAML and the command line have it."""
+    default = parameter.default
+    return repr(default) if isinstance(default, str) else str(default).lower()
 
 
 def _kind(parameter: Parameter) -> str:

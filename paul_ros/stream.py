@@ -200,6 +200,13 @@ class LiftStream:
         metric = self.intrinsics is not None and self.lifter.model.metres_per_unit is not None
         return "m" if metric else "model"
 
+    def take_over(self, before: LiftStream) -> None:
+        """Goes on where another stream stopped: camera, depth images and counts are those of before."""
+        self.intrinsics, self._image_size = before.intrinsics, before._image_size
+        self._depths, self._steady, self._last_stamp = before._depths, before._steady, before._last_stamp
+        self.counts, self.drops, self.notes = before.counts, before.drops, before.notes
+        self.explanations, self.lift_us = before.explanations, before.lift_us
+
     def camera_info(self, msg) -> None:
         """Takes the intrinsics; of an unusable CameraInfo nothing is taken and the drop is counted."""
         with self.guard():

@@ -83,7 +83,7 @@ def test_the_robots_rooms_never_import_torch(room: str) -> None:
 
 def test_ros_is_imported_by_the_node_and_else_only_where_it_is_needed() -> None:
     eager = [use for room in ROOMS for use in imports_of(room) if use.package in ROS and not use.lazy]
-    assert {use.file for use in eager} == {Path("paul_ros/node.py")}
+    assert {use.file for use in eager} == {Path(f"paul_ros/{name}.py") for name in ("node", "inputs", "ros")}
 
 
 @pytest.mark.parametrize("room", ["msg_adapters", "paul_ros"])

@@ -13,9 +13,10 @@ import time
 
 import numpy as np
 import pytest
-from conftest import ROOT, LifterProcess, RosMake, camera_info, header_of, persons_at, seen
+from conftest import ROOT, LifterProcess, camera_info, header_of, persons_at, seen
 from foreign_messages import DEFINITIONS as FOREIGN
 from foreign_messages import HRI, OPENDR, LiveMake, hri, opendr
+from node_bench import GOOD, MAKE, PATIENCE, Bench, class_of, cloud, good, header_in, nobody, set_parameters
 
 import msg_adapters
 from msg_adapters import outputs
@@ -23,102 +24,6 @@ from paul_ros import parameters
 from paul_ros.depth import SURFACE
 from paul_ros.skeleton import load_layout
 from paul_ros.stream import OUTPUTS
-
-MAKE = RosMake()
-GOOD = persons_at((0.3, 0, 4))
-PATIENCE = 60.0
-
-
-class Bench:
-    """The other side: publishes to one lifter and keeps what it says, by output name."""
-
-    def __init__(
-        self, ros, lifter: LifterProcess, kind: str = "sensor_msgs/msg/PointCloud2", best_effort: bool = False
-    ) -> None:
-        from diagnostic_msgs.msg import DiagnosticArray
-        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-        from std_msgs.msg import String
-
-        self.ros, self.lifter, self.stamp = ros, lifter, 100_000
-        self.node = ros.create_node("bench", namespace=lifter.namespace)
-        self.got = {name: [] for name in (*OUTPUTS, "layout", "diagnostics")}
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-        self.keypoints = self.node.create_publisher(
-            class_of(kind), "keypoints", QoSProfile(depth=10, reliability=reliability)
-        )
-        self.camera = self.node.create_publisher(class_of("sensor_msgs/msg/CameraInfo"), "camera_info", 10)
-        self.depth = self.node.create_publisher(class_of("sensor_msgs/msg/Image"), "depth", 10)
-        for name, type_name in OUTPUTS.items():
-            self.node.create_subscription(class_of(type_name), f"lifter/{name}", self.got[name].append, 10)
-        self.node.create_subscription(String, "lifter/layout", self.got["layout"].append, latched)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-
-    def close(self) -> None:
-        self.node.destroy_node()
-
-    def _on_diagnostics(self, msg) -> None:
-        for status in msg.status:
-            if status.name == f"{self.lifter.namespace}/lifter: lifting":
-                stamp = msg.header.stamp
-                self.got["diagnostics"].append((stamp.sec * 10**9 + stamp.nanosec, status))
-
-    def until(self, condition, what: str) -> None:
-        """Waits for a condition while messages come in; fails with the node's log."""
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert self.lifter.process.poll() is None, f"the node ended\n{self.lifter.log()}"
-            assert time.monotonic() < end, f"never came: {what}\n{self.lifter.log()}"
-            self.ros.spin_once(self.node, timeout_sec=0.02)
-
-    def matched(self) -> None:
-        """Until publishers and subscribers of both sides know each other: all outputs answer probes."""
-        self.until(
-            lambda: all(p.get_subscription_count() for p in (self.keypoints, self.camera, self.depth)),
-            "subscriptions of the node",
-        )
-
-        def answered():
-            self.send(nobody())
-            return all(self.got[name] for name in (*OUTPUTS, "layout"))
-
-        self.until(answered, "answers on all outputs")
-
-    def send(self, fill) -> int:
-        """Publishes fill(header) with a stamp of its own; returns the stamp's seconds."""
-        self.stamp += 1
-        self.keypoints.publish(fill(header_of(MAKE, seconds=self.stamp)))
-        return self.stamp
-
-    def answer(self, name: str, seconds: int):
-        """The output with this stamp."""
-
-        def stamped():
-            return [msg for msg in self.got[name] if header_in(msg).stamp.sec == seconds]
-
-        self.until(stamped, f"{name} of stamp {seconds}")
-        return stamped()[0]
-
-    def lifts(self) -> np.ndarray:
-        """A good frame is answered by its persons, (N, 17, 3)."""
-        poses = self.answer("poses", self.send(good())).poses
-        assert len(poses) == 17
-        return np.array([(p.position.x, p.position.y, p.position.z) for p in poses]).reshape(-1, 17, 3)
-
-    def layout(self) -> dict:
-        return json.loads(self.got["layout"][-1].data)
-
-    def units(self) -> str:
-        return self.layout()["units"]
-
-    def next_diagnostics(self):
-        """The first status that was made after now; one may be on its way already."""
-        now, got = time.time_ns(), self.got["diagnostics"]
-        self.until(lambda: got and got[-1][0] > now, "diagnostics")
-        return got[-1][1]
-
-    def diagnosed(self) -> dict:
-        return {pair.key: pair.value for pair in self.next_diagnostics().values}
 
 
 def half_way(seconds: int):
@@ -137,31 +42,6 @@ def half_way(seconds: int):
     )
 
 
-def header_in(msg):
-    return msg.markers[0].header if hasattr(msg, "markers") else msg.header
-
-
-def class_of(type_name: str) -> type:
-    return type(MAKE(type_name))
-
-
-def cloud(xy: np.ndarray, **changes):
-    """header -> a keypoint cloud with some of its fields changed."""
-
-    def fill(header):
-        ids = [str(person) for person in range(len(xy))]
-        msg = outputs.keypoints_cloud(MAKE, header, xy, np.ones(xy.shape[:2]), ids)
-        for name, value in changes.items():
-            setattr(msg, name, value)
-        return msg
-
-    return fill
-
-
-def good():
-    return cloud(seen(GOOD))
-
-
 def crowd(header):
     """10,000 persons in one byte a point, x and y the same: best effort may lose a message of megabytes."""
     same = [MAKE("sensor_msgs/msg/PointField", name=name, offset=0, datatype=2, count=1) for name in "xy"]
@@ -177,10 +57,6 @@ def crowd(header):
         data=MAKE.octets(bytes(170_000)),
         is_dense=True,
     )
-
-
-def nobody():
-    return cloud(np.empty((0, 17, 2)))
 
 
 def fields(*names_and_datatypes) -> list:
@@ -319,34 +195,19 @@ def test_diagnostics_tell_counts_times_units_and_model(bench, model_file):
     assert status.level == b"\x01" and "no keypoints" in status.message
 
 
-def set_parameter(bench, **values):
-    """Sets parameters over their service; whether each was accepted."""
-    from rcl_interfaces.srv import SetParameters
-    from rclpy.parameter import Parameter
-
-    client = bench.node.create_client(SetParameters, "lifter/set_parameters")
-    bench.until(client.service_is_ready, "the parameter service")
-    request = SetParameters.Request(
-        parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-    )
-    future = client.call_async(request)
-    bench.until(future.done, "the answer of the parameter service")
-    return [result.successful for result in future.result().results]
-
-
 def test_parameters_may_change_where_the_table_says_so(bench):
-    assert set_parameter(bench, max_persons=1) == [True]
+    assert set_parameters(bench, max_persons=1) == [""]
     bench.send(cloud(seen(persons_at((0, 0, 4), (1, 0, 4)))))
     bench.lifts()
     assert int(bench.diagnosed()["dropped_too_many_persons"]) >= 1
-    assert set_parameter(bench, max_persons=64, min_confidence=0.5) == [True, True]
-    assert set_parameter(bench, person_height=1.2, smoothing=2.0) == [True, True]
+    assert set_parameters(bench, max_persons=64, min_confidence=0.5) == ["", ""]
+    assert set_parameters(bench, person_height=1.2, smoothing=2.0) == ["", ""]
     told = ("person_height", "size_spread", "smoothing_hz")
     bench.until(lambda: [bench.layout()[key] for key in told] == [1.2, 0, 2], "the new layout")
-    assert set_parameter(bench, person_height=0.0, smoothing=0.0) == [True, True]
+    assert set_parameters(bench, person_height=0.0, smoothing=0.0) == ["", ""]
     bench.until(lambda: [bench.layout()[key] for key in told] == [1.7, 0.06, 0], "the old layout")
-    assert set_parameter(bench, min_confidence=1.5) == [False]
-    assert set_parameter(bench, model="other") == [False]
+    assert "range" in set_parameters(bench, min_confidence=1.5)[0]
+    assert "read-only" in set_parameters(bench, input_type="auto")[0]
 
 
 def test_a_subscriber_with_a_qos_that_cannot_match_is_warned_about(bench):
@@ -459,7 +320,7 @@ def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, mod
 @pytest.mark.parametrize("type_name", sorted(set(FOREIGN) & set(msg_adapters.SUPPORTED)))
 def test_every_foreign_package_that_is_missing_is_named(type_name):
     """The node's warning is made of this error."""
-    from paul_ros.node import message_class
+    from paul_ros.ros import message_class
 
     with pytest.raises(ImportError, match=type_name.split("/")[0]):
         message_class(type_name)
@@ -520,6 +381,7 @@ def lifter_node(ros, monkeypatch):
     from paul_ros.node import LifterNode
 
     node = LifterNode()
+    node.start()
     yield node
     node.destroy_node()
 
@@ -581,7 +443,8 @@ OPENDR_POINTS = len(load_layout("openpose18").names)
 
 
 def one_person(node, build, seconds: int, **person) -> None:
-    node._on_keypoints(build(LiveMake(), header_of(MAKE, seconds), **person), {"publication_sequence_number": 0})
+    msg = build(LiveMake(), header_of(MAKE, seconds), **person)
+    node._on_keypoints(OPENDR if build is opendr else HRI, msg, "/humans/bodies/anna/skeleton2d", 0)
 
 
 @pytest.fixture
@@ -609,7 +472,6 @@ def poses_of_node(ros, lifter_node):
 
 
 def test_persons_in_a_message_each_are_published_when_no_more_come(lifter_node, poses_of_node):
-    lifter_node._input_type = OPENDR
     for ident, pose in enumerate(POSES, 1):
         one_person(lifter_node, opendr, 1, pose=pose, ident=ident)
     assert lifter_node.stream.counts["frames"] == 0
@@ -618,13 +480,12 @@ def test_persons_in_a_message_each_are_published_when_no_more_come(lifter_node, 
     one_person(lifter_node, opendr, 2, pose=POSES[0], ident=1)
     _, image = poses_of_node(lambda got: len(got) == 2, "one more image")
     assert (image.header.stamp.sec, len(image.poses)) == (2, OPENDR_POINTS)
-    assert lifter_node._silence_timer.is_canceled()
+    assert lifter_node._silence.is_canceled()
     assert lifter_node.stream.counts == dict(frames=2, persons=3, lifted=3) and not lifter_node.stream.drops
 
 
 def test_a_node_kept_from_running_between_two_persons_tears_no_image(lifter_node, poses_of_node):
     """Timers come before messages: the first late tick finds the second person still waiting."""
-    lifter_node._input_type = OPENDR
     one_person(lifter_node, opendr, 1, pose=POSES[0], ident=1)
     time.sleep(0.05)
     lifter_node._on_silence()
@@ -636,11 +497,11 @@ def test_a_node_kept_from_running_between_two_persons_tears_no_image(lifter_node
 def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
     from paul_ros.node import _spin
 
-    lifter_node._input_type = OPENDR
     one_person(lifter_node, opendr, 1, pose=POSES[0])
     stop = threading.Event()
     stop.set()
     _spin(lifter_node, stop)
+    lifter_node.end()
     assert "1 frames, 1 of 1 persons lifted" in lifter_node.summary()
     (image,) = poses_of_node(bool, "the image")
     assert len(image.poses) == OPENDR_POINTS
@@ -648,8 +509,6 @@ def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
 
 def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):
     published = []
-    monkeypatch.setattr(lifter_node, "_topic", "/humans/bodies/anna/skeleton2d")
-    monkeypatch.setattr(lifter_node, "_input_type", HRI)
     monkeypatch.setattr(lifter_node, "_publish", published.append)
     lifter_node._on_camera_info(camera_info(MAKE))
     one_person(lifter_node, hri, 1, pose=POSES[0])

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node's input of keypoints: subscribed as soon as its type is known, and what is wrong with it said aloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+import msg_adapters
+from paul_ros.health import Aloud
+from paul_ros.ros import OVERRIDES, input_qos, message_class, unheard
+from paul_ros.tracked import BODY, LIST, Tracked
+
+
+def readable() -> list[str]:
+    """Names of the types that `keypoints` may have."""
+    return [*msg_adapters.SUPPORTED, LIST]
+
+
+class KeypointInput:
+    """The subscription of `keypoints`, or, where its topic lists the bodies of ROS4HRI, one for each of these.
+
+    type_name: of the topic, None until it is known and subscribed. problem: why it cannot be read, '' where it can.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        wanted: str,
+        take: Callable[[str, object, str, int], None],
+        most: Callable[[], int],
+        warn: Aloud,
+        mismatch: Callable[[str, str], None],
+    ) -> None:
+        """wanted: a type's name, or auto; most(): bodies to follow; mismatch(topic, text): QoS that do not match.
+
+        take(type_name, msg, topic, missed) gets each message, and how many before it were published but never came, or
+        were replaced by newer ones while the node was busy. Raises ValueError where the wanted type cannot be read.
+        """
+        if wanted != "auto" and wanted not in readable():
+            raise ValueError(f"input_type is {wanted}; it must be auto or one of {', '.join(readable())}")
+        self.type_name: str | None = None
+        self.problem = ""
+        self._node, self._wanted, self._take, self._most = node, wanted, take, most
+        self._warn, self._mismatch = warn, mismatch
+        self.topic = node.resolve_topic_name(topic)
+        self._subscription: Subscription | None = None
+        self._bodies: Tracked | None = None
+        self._numbers: dict[str, int] = {}
+
+    def look(self) -> bool:
+        """Subscribes if that is possible now; says what is missing where it is not. Whether it is subscribed."""
+        types = [self._wanted] if self._wanted != "auto" else self._published_types()
+        known = [name for name in types if name in readable()]
+        if not types:
+            self._warn("no input", f"nobody publishes {self.topic} yet; remap `keypoints` to your detector")
+        elif not known:
+            self._cannot(
+                "unknown type",
+                f"{self.topic} has the type {', '.join(types)}, which cannot be read; "
+                f"readable are {', '.join(readable())}",
+            )
+        else:
+            self._open(known[0])
+        return self.type_name is not None
+
+    def close(self) -> None:
+        """Ends all subscriptions; look() may open them again."""
+        if self._bodies:
+            self._bodies.clear()
+        if self._subscription:
+            self._node.destroy_subscription(self._subscription)
+        self._bodies = self._subscription = self.type_name = None
+
+    def _follow(self, msg) -> None:
+        """Reads the bodies that a list names."""
+        if left := self._bodies.update(msg.ids, self._most()):
+            self._warn("bodies", f"bodies that are not read, by their ids: {', '.join(map(repr, left[:5]))}")
+
+    def _published_types(self) -> list[str]:
+        return sorted({info.topic_type for info in self._node.get_publishers_info_by_topic(self.topic)})
+
+    def _cannot(self, key: str, text: str) -> None:
+        self.problem = text
+        self._warn(key, text)
+
+    def _open(self, type_name: str) -> None:
+        try:
+            kinds = [message_class(name) for name in ([LIST, BODY] if type_name == LIST else [type_name])]
+            self._subscription = self._subscribe(kinds[0], type_name)
+        except ImportError as error:
+            self._cannot(
+                "no package",
+                f"{self.topic} has the type {type_name}, whose package cannot be "
+                f"imported ({error}); install it or source its workspace",
+            )
+            return
+        self.type_name, self.problem = type_name, ""
+        self._node.get_logger().info(f"reading {type_name} from {self.topic}")
+
+    def _subscribe(self, kind: type, type_name: str) -> Subscription:
+        options = dict(event_callbacks=unheard(self.topic, self._mismatch), qos_overriding_options=OVERRIDES)
+        if type_name == LIST:
+            self._bodies = Tracked(self.topic, self._open_body, self._node.destroy_subscription)
+            return self._node.create_subscription(kind, self.topic, self._follow, input_qos(), **options)
+        on_message = self._reader(type_name, self.topic)
+        return self._node.create_subscription(kind, self.topic, on_message, input_qos(), **options)
+
+    def _open_body(self, topic: str) -> Subscription:
+        return self._node.create_subscription(message_class(BODY), topic, self._reader(BODY, topic), input_qos())
+
+    def _reader(self, type_name: str, topic: str) -> Callable:
+        self._numbers[topic] = 0
+
+        def on_message(msg, info: dict) -> None:
+            self._take(type_name, msg, topic, self._missed(topic, info["publication_sequence_number"]))
+
+        return on_message
+
+    def _missed(self, topic: str, number: int) -> int:
+        """How many numbers were left out; of several publishers they cannot be told apart, then none is counted."""
+        last, self._numbers[topic] = self._numbers[topic], number
+        missed = number - last - 1 if last else 0
+        return missed if missed > 0 and self._node.count_publishers(topic) == 1 else 0
