@@ -42,21 +42,23 @@ def refine(S: np.ndarray, W: np.ndarray, visible: np.ndarray, R: np.ndarray, T: 
         visible: (N,P) bool.
         R, T: (N,3,3) and (N,3), the start.
     """
-    w = visible / np.maximum(visible.sum(1, keepdims=True), 1)
     W = np.where(visible[:, None], W, 0.0)
     with np.errstate(all="ignore"):  # of images that no camera gives; no step from them is better
-        best, damping = _State.of(R, R @ S, T, W, w), np.full(len(S), _DAMPING)
+        best, damping = _State.of(R, R @ S, T, W, visible), np.full((len(S), 1), _DAMPING)
         for _ in range(_STEPS):
-            turn, shift = _step(best, w, damping)
-            tried = _State.of(turn @ best.R, turn @ best.Y, best.T + shift, W, w)
+            turn, shift = _step(best, damping)
+            tried = _State.of(turn @ best.R, turn @ best.Y, best.T + shift, W, visible)
             better = tried.cost < best.cost
-            damping = damping * np.where(better, 0.1, 10.0)
+            damping *= np.where(better, 0.1, 10.0)[:, None]
             best = tried if better.all() else _State(*map(_choose(better), tried, best))
-        return PinholePose(best.R, best.T, np.where(visible[:, None], best.error, 0.0))
+        return PinholePose(best.R, best.T, best.error)
 
 
 class _State(NamedTuple):
-    """Poses, turned shapes Y (N,3,P), their image (N,2,P), inverse depths (N,P), what is missed (N,2,P), its cost."""
+    """Poses, turned shapes Y (N,3,P), their image (N,2,P), inverse depths (N,P), what is missed (N,2,P), its cost.
+
+    Hidden points are infinitely far away, and so at the image's origin, where W has them too: they add nothing.
+    """
 
     R: np.ndarray
     Y: np.ndarray
@@ -67,44 +69,45 @@ class _State(NamedTuple):
     cost: np.ndarray
 
     @classmethod
-    def of(cls, R: np.ndarray, Y: np.ndarray, T: np.ndarray, W: np.ndarray, w: np.ndarray) -> _State:
-        inverse = 1.0 / np.maximum(Y[:, 2] + T[:, 2:], _NEAREST * T[:, 2:])
-        image = (Y[:, :2] + T[:, :2, None]) * inverse[:, None]
+    def of(cls, R: np.ndarray, Y: np.ndarray, T: np.ndarray, W: np.ndarray, visible: np.ndarray) -> _State:
+        X = Y + T[:, :, None]
+        inverse = visible / np.maximum(X[:, 2], _NEAREST * T[:, 2:])
+        image = X[:, :2] * inverse[:, None]
         error = W - image
-        return cls(R, Y, T, image, inverse, error, np.einsum("ndp,ndp,np->n", error, error, w))
+        return cls(R, Y, T, image, inverse, error, (error * error).sum((1, 2)))
 
 
 def _choose(better: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     return lambda yes, no: np.where(better.reshape(-1, *(1,) * (yes.ndim - 1)), yes, no)
 
 
-def _step(pose: _State, w: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _step(pose: _State, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotations (N,3,3) and shifts (N,3) of one damped Gauss-Newton step.
 
     A shift t and a turn about a move a point Y + T by t + a x Y, and its image (u, v), with d its inverse depth, by
     d times the first two parts of that less (u, v) times the third.
     """
     N, _, P = pose.Y.shape
-    parts = np.zeros((N, 8, P))
-    parts[:, 1], parts[:, 2:5], parts[:, 5:] = 1.0, pose.Y, -pose.Y
-    moved = parts.take(_MOVED, axis=1).reshape(N, 6, 3, P)
+    moved = (_TURNED @ pose.Y + _SHIFTED).reshape(N, 6, 3, P)
     J = (moved[:, :, :2] - pose.image[:, None] * moved[:, :, 2:]) * pose.inverse[:, None, None]
-    weighted = (J * w[:, None, None]).reshape(N, 6, 2 * P)
-    H = weighted @ J.reshape(N, 6, 2 * P).transpose(0, 2, 1)
+    J = J.reshape(N, 6, 2 * P)
+    H = J @ J.transpose(0, 2, 1)
     diagonal = H.reshape(N, 36)[:, ::7]
-    diagonal *= 1 + damping[:, None]
+    diagonal *= 1 + damping
     diagonal += _TINY
-    step = np.linalg.solve(H, weighted @ pose.error.reshape(N, 2 * P, 1))[..., 0]
+    step = np.linalg.solve(H, J @ pose.error.reshape(N, 2 * P, 1))[..., 0]
     return _rotation(step[:, 3:]), step[:, :3]
 
 
-_MOVED = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 7, 3, 4, 0, 5, 6, 2, 0]
-"""Shifts along and turns about the three axes: of 0, 1, Y and -Y the row that each of their three parts is."""
 _CROSS = np.zeros((3, 3, 3))
 _CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]], _CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0, -1.0
+"""a @ _CROSS is the matrix that takes Y to a x Y."""
+_SHIFTED, _TURNED = np.eye(6, 3).reshape(18, 1), np.vstack([np.zeros((9, 3)), _CROSS.reshape(9, 3)])
+"""How unit shifts along and turns about the three axes move a point Y: by _SHIFTED + _TURNED @ Y, three parts each."""
+_HALF_CROSS, _EYE = _CROSS.reshape(3, 9) / 2, np.eye(3)
 
 
 def _rotation(a: np.ndarray) -> np.ndarray:
     """Cayley's rotations (N,3,3) about the vectors a (N,3), by their lengths up to the third order."""
-    K = (0.5 * a @ _CROSS.reshape(3, 9)).reshape(-1, 3, 3)
-    return np.eye(3) + (K + K @ K) * (2.0 / (1.0 + 0.25 * (a * a).sum(1)))[:, None, None]
+    K = (a @ _HALF_CROSS).reshape(-1, 3, 3)
+    return _EYE + (K + K @ K) * (2.0 / (1.0 + 0.25 * (a[:, None] @ a[:, :, None])))
