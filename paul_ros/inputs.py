@@ -10,7 +10,7 @@ from rclpy.subscription import Subscription
 
 import msg_adapters
 from paul_ros.health import Aloud
-from paul_ros.ros import OVERRIDES, input_qos, message_class, unheard
+from paul_ros.ros import NOT_POSSIBLE, OVERRIDES, input_qos, message_class, unheard
 from paul_ros.tracked import BODY, LIST, Tracked
 
 
@@ -97,6 +97,9 @@ class KeypointInput:
                 f"{self.topic} has the type {type_name}, whose package cannot be "
                 f"imported ({error}); install it or source its workspace",
             )
+            return
+        except NOT_POSSIBLE as error:
+            self._cannot("impossible", f"{self.topic} cannot be subscribed: {error}")
             return
         self.type_name, self.problem = type_name, ""
         self._node.get_logger().info(f"reading {type_name} from {self.topic}")

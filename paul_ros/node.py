@@ -28,10 +28,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, Image
@@ -43,6 +41,7 @@ from paul_ros.inputs import KeypointInput
 from paul_ros.model import ModelError
 from paul_ros.parameters import LIVE, PARAMETERS, as_markdown
 from paul_ros.ros import (
+    NOT_POSSIBLE,
     OVERRIDES,
     RosMake,
     descriptor,
@@ -68,8 +67,8 @@ _UNITS_SECONDS = 60.0
 _STOP_SECONDS = 0.2
 #: Parameters that take another stream.
 _SWITCHING = ("model", "layout", "output_layout")
-#: What parameters may be refused with. rclpy has no common class for its errors, but most are RuntimeErrors.
-_REFUSALS = (ModelError, LayoutError, ParameterException, InvalidQosOverridesError, ValueError, RuntimeError)
+#: What parameters are refused with.
+_REFUSALS = (ModelError, LayoutError, *NOT_POSSIBLE)
 
 
 def _transition(callback):

@@ -8,15 +8,23 @@ import functools
 import importlib
 from collections.abc import Callable
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import ParameterException
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 
 from paul_ros.parameters import Parameter
 
+
+def _checked(qos: QoSProfile) -> SetParametersResult:
+    """rclpy itself checks all but this, which would end in a TypeError of its bindings."""
+    return SetParametersResult(successful=qos.depth >= 0, reason=f"depth is {qos.depth}; it must not be negative")
+
+
 OVERRIDES = QoSOverridingOptions(
-    (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY)
+    (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY),
+    callback=_checked,
 )
 """What may be set as a parameter qos_overrides./TOPIC.subscription.POLICY, or .publisher.POLICY."""
 
@@ -29,6 +37,10 @@ def message_class(type_name: str) -> type:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except AttributeError:
         raise ImportError(f"{package} has no message {name}") from None
+
+
+NOT_POSSIBLE = (ParameterException, InvalidQosOverridesError, ValueError, RuntimeError)
+"""What rclpy raises of parameters, QoS overrides among them, that it cannot use. It has no common class for these."""
 
 
 class RosMake:

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""QoS, clocks and what /diagnostics tells of them, over DDS."""
+
+from __future__ import annotations
+
+import re
+import time
+
+import pytest
+from conftest import camera_info
+from node_bench import MAKE, Bench, class_of, good
+
+
+@pytest.fixture
+def started(ros, start_lifter, model_file):
+    """started(*arguments) -> a bench whose node is not matched yet."""
+    benches = []
+
+    def start(*arguments: str) -> Bench:
+        benches.append(Bench(ros, start_lifter("-p", f"model:={model_file}", *arguments)))
+        return benches[-1]
+
+    yield start
+    for bench in benches:
+        bench.close()
+        if bench.lifter.process.poll() is None:
+            bench.lifter.stop()
+
+
+def test_levels_from_the_first_to_the_last_frame(started):
+    from diagnostic_msgs.msg import DiagnosticStatus
+
+    bench = started()
+    bench.until(lambda: bench.got["diagnostics"], "the first diagnostics")
+    bench.matched()
+    bench.lifts()
+    told = bench.next_diagnostics()
+    assert told.level == DiagnosticStatus.WARN
+    bench.camera.publish(camera_info(MAKE))
+    bench.until(lambda: bench.units() == "m", "metres")
+
+    def well():
+        time.sleep(0.02)  # faster would lose some, which is a warning
+        bench.send(good())
+        return bench.got["diagnostics"][-1][1].level == DiagnosticStatus.OK
+
+    bench.until(well, "level OK")
+    values = {pair.key: pair.value for pair in bench.got["diagnostics"][-1][1].values}
+    assert float(values["rate_in_hz"]) > 0 and float(values["rate_out_hz"]) > 0
+    assert (values["certified_share"], values["ambiguous_share"]) == ("1.000", "0.000")
+    assert values["latency_ms_median"] == "unknown"  # the stamps of these tests are of no clock
+    bench.until(lambda: bench.got["diagnostics"][-1][1].level == DiagnosticStatus.STALE, "level STALE")
+    assert re.search(r"no keypoints for \d s on /", bench.lifter.log())
+
+
+def test_latency_is_from_stamp_to_publish(started):
+    bench = started()
+    bench.matched()
+
+    def stamped(header):
+        now = time.time_ns()
+        header.stamp.sec, header.stamp.nanosec = divmod(now, 10**9)
+        return good()(header)
+
+    def known():
+        bench.send(stamped)
+        return bench.diagnosed()["latency_ms_median"] != "unknown"
+
+    bench.until(known, "a latency")
+    values = bench.diagnosed()
+    assert 0 < float(values["latency_ms_median"]) <= float(values["latency_ms_p99"]) < 1000
+
+
+def test_a_publisher_whose_qos_does_not_match_is_named(ros, started):
+    """The node is told to ask for reliable messages, this publisher is not."""
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+    bench = started("-r", "keypoints:=/loud", "-p", "qos_overrides./loud.subscription.reliability:=reliable")
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/loud", best_effort)
+    bench.until(lambda: "publisher of /loud" in bench.lifter.log(), "the warning")
+    assert "RELIABILITY" in bench.lifter.log() and "qos_overrides./loud.subscription.reliability" in bench.lifter.log()
+    bench.until(lambda: any("QoS" in status.message for _, status in bench.got["diagnostics"]), "the diagnostics")
+
+
+def test_a_subscriber_whose_qos_does_not_match_is_named_and_the_override_helps(started):
+    from geometry_msgs.msg import PoseArray
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for override in ((), ("-p", "qos_overrides./said.publisher.durability:=transient_local")):
+        got = []
+        bench = started("-r", "~/poses:=/said", *override)
+        bench.node.create_subscription(PoseArray, "/said", got.append, latched)
+        if override:
+            bench.until(lambda: bench.send(good()) and got, "poses")
+            assert "QoS" not in bench.lifter.log()
+        else:
+            bench.until(lambda: "subscriber of /said" in bench.lifter.log(), "the warning")
+            assert "DURABILITY" in bench.lifter.log()
+        bench.lifter.stop()
+
+
+@pytest.mark.parametrize("value", ["sometimes", "-5"])
+def test_an_override_that_cannot_be_is_refused(start_lifter, model_file, value):
+    policy = "reliability" if value == "sometimes" else "depth"
+    lifter = start_lifter(
+        "-p", f"model:={model_file}", "-r", "~/poses:=/said", "-p", f"qos_overrides./said.publisher.{policy}:={value}"
+    )
+    assert lifter.process.wait(20) == 1
+    (line,) = lifter.log().splitlines()
+    assert line.startswith("lifter: ") and (value in line or policy in line)
+
+
+def test_an_input_whose_override_cannot_be_is_an_error_in_diagnostics(started):
+    bench = started("-r", "keypoints:=/odd", "-p", "qos_overrides./odd.subscription.reliability:=sometimes")
+    bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/odd", 1)
+    bench.until(lambda: "sometimes" in bench.lifter.log(), "the warning")
+    assert bench.next_diagnostics().level == b"\x02" and "Traceback" not in bench.lifter.log()
+
+
+def test_simulated_time_that_is_set_back(started):
+    """As a bag that loops: diagnostics go on while it stands, the node lifts on, and says that time was set back."""
+    bench = started("-p", "use_sim_time:=true")
+    clock = bench.node.create_publisher(class_of("rosgraph_msgs/msg/Clock"), "/clock", 10)
+    bench.matched()
+    said = "time was set back by 95.0 s"
+
+    def tick(seconds: int):
+        clock.publish(MAKE("rosgraph_msgs/msg/Clock", clock=MAKE("builtin_interfaces/msg/Time", sec=seconds)))
+
+    def stamps() -> list[int]:
+        return [stamp for stamp, _ in bench.got["diagnostics"]]
+
+    def at(seconds: int):
+        def told():
+            tick(seconds)
+            return stamps() and stamps()[-1] == seconds * 10**9
+
+        return told
+
+    bench.until(at(100), "diagnostics of simulated time")
+    bench.lifts()
+    bench.until(at(5), "diagnostics after the jump")
+    assert bench.lifter.log().count(said) == 1
+    bench.lifts()
+    count = len(stamps())
+    bench.until(lambda: len(stamps()) >= count + 2, "diagnostics while time stands still")
+    assert stamps()[-1] == 5 * 10**9
