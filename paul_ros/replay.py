@@ -404,7 +404,8 @@ class Matched:
 
 def matched(pairs: list[tuple[Lifted, np.ndarray]]) -> Matched:
     """All persons that were lifted and whose truth has LEAST_POINTS points or more, not all in one place."""
-    pairs = [(lifted, truth) for lifted, truth in pairs if len(truth) == len(lifted.points)]
+    # Before anybody is seen the input's layout may be unknown, and arrays of nobody have another number of points.
+    pairs = [(lifted, truth) for lifted, truth in pairs if len(truth) == len(lifted.points) > 0]
     if not pairs:
         return Matched(np.zeros((0, 1, 3)), np.zeros((0, 1, 3)), np.zeros((0, 1), bool))
     truth = np.concatenate([truth for _, truth in pairs])
