@@ -155,8 +155,7 @@ class Lifter:
         W, turn, pixels = xy.transpose(0, 2, 1), None, 1.0
         if camera is not None:
             view = centred_view(xy, visible, camera)
-            W, turn, pixels = view.W, view.turn, (camera.fx + camera.fy) / 2
-            visible = visible & np.isfinite(W).all(1)
+            W, visible, turn, pixels = view.W, view.seen, view.turn, (camera.fx + camera.fy) / 2
         fit = self._fit_sure(W, visible, camera is not None)
         root, units, near = list(self.model.layout.root), self._units(camera), np.True_
         shape = self._as_seen(fit, camera is not None)
@@ -168,15 +167,16 @@ class Lifter:
         # Again: a virtual camera does not see all points.
         enough = enough_visible(visible, self.model.layout)
         fixed = fit.fixed & (camera is None or fit.extent * pixels >= MIN_EXTENT)
+        root = points[:, root].mean(1)
         lifted = Lifted(
             points=points,
-            root=points[:, root].mean(1),
+            root=root,
             rotation=fit.R if turn is None else turn @ fit.R,
             scale=pixels / fit.T[:, 2],
             reprojection=pixels * fit.residual,
             ambiguity=fit.ambiguity,
             certified=fit.certified,
-            distance_sigma=self._sigma(points[:, root].mean(1), fit, units),
+            distance_sigma=self._sigma(root, fit, units),
             used=fit.used,
             reason=("",) * len(xy),
             units=units,
@@ -198,9 +198,8 @@ class Lifter:
         if self.model.misfit is None or isinstance(self.model, RigidModel):
             return shape
         depth = fit.T[:, 2:] + shape[:, 2] if pinhole else fit.T[:, 2:]
-        off = fit.missed * depth[:, None]
-        square = np.maximum((off * off).sum(1, keepdims=True), 1e-300)
-        shape[:, :2] += np.minimum(1.0, (2 * self.model.misfit) ** 2 / square) * off
+        square = np.maximum(fit.square * depth * depth, 1e-300)
+        shape[:, :2] += (np.minimum(1.0, (2 * self.model.misfit) ** 2 / square) * depth)[:, None] * fit.missed
         return shape
 
     def _sigma(self, root: np.ndarray, fit: _Fit, units: str) -> np.ndarray:
@@ -214,8 +213,11 @@ class Lifter:
         fit = self._fit(W, visible, pinhole)
         if isinstance(self.model, RigidModel):
             return fit  # What the mean shape misses is its own fault.
-        sure = visible & ~_wild(fit.missed, visible, fit.extent)
-        again = np.flatnonzero((sure != visible).any(1) & enough_visible(sure, self.model.layout))
+        wild = _wild(fit)
+        if not wild.any():
+            return fit
+        sure = visible & ~wild
+        again = np.flatnonzero(wild.any(1) & enough_visible(sure, self.model.layout))
         if not len(again):
             return fit
         second = self._fit(W[again], sure[again], pinhole)
@@ -234,39 +236,41 @@ class Lifter:
             R, T, missed = refine(S, W, visible, R, T)
         else:
             missed = np.where(visible[:, None], W - scale[..., None] * (R[:, :2] @ S + T[:, :2, None]), 0.0)
-        return _Fit(S, R, T, missed, visible.copy(), fixed, pose.ambiguity, pose.certified.copy(), pose.extent)
+        square = (missed * missed).sum(1)
+        residual = np.sqrt(square.sum(1) / np.maximum(visible.sum(1), 1))
+        used, certified = visible.copy(), pose.certified.copy()
+        return _Fit(S, R, T, missed, square, residual, used, fixed, pose.ambiguity, certified, pose.extent)
 
 
 class _Fit(NamedTuple):
     """N shapes (N,3,P) and their poses, in model units: R (N,3,3), T (N,3), T[2] the inverse of the scale.
 
-    missed: (N,2,P) image points less those of the model; used: (N,P) the points it was made from; fixed: (N,), they
-    determine a pose; extent: (N,) root mean square distance of the image points from their mean.
+    missed: (N,2,P) image points less those of the model, nothing where not used; square: (N,P) of their lengths;
+    residual: (N,) root mean square of those used; used: (N,P) the points it was made from; fixed: (N,), they determine
+    a pose; extent: (N,) root mean square distance of the image points from their mean.
     """
 
     S: np.ndarray
     R: np.ndarray
     T: np.ndarray
     missed: np.ndarray
+    square: np.ndarray
+    residual: np.ndarray
     used: np.ndarray
     fixed: np.ndarray
     ambiguity: np.ndarray
     certified: np.ndarray
     extent: np.ndarray
 
-    @property
-    def residual(self) -> np.ndarray:
-        """(N,) root mean square of what is missed at the points used."""
-        return np.sqrt((self.missed**2).sum((1, 2)) / np.maximum(self.used.sum(1), 1))
 
-
-def _wild(missed: np.ndarray, visible: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """(N,P) bool: visible points that the found shape misses so far that a detector must have been wrong."""
-    square = np.where(visible, (missed * missed).sum(1), np.inf)
-    middle = np.maximum(visible.sum(1) - 1, 0) // 2
-    median = np.sort(square, axis=1)[np.arange(len(square)), middle]
-    limit = np.maximum(_WILD**2 * median, _WILD_EXTENT**2 * extent**2)
-    return visible & (square > limit[:, None])
+def _wild(fit: _Fit) -> np.ndarray:
+    """(N,P) bool: points used that the found shape misses so far that a detector must have been wrong."""
+    wild = fit.square > (_WILD_EXTENT * fit.extent)[:, None] ** 2
+    if wild.any():
+        middle = np.maximum(fit.used.sum(1, keepdims=True) - 1, 0) // 2
+        median = np.take_along_axis(np.sort(np.where(fit.used, fit.square, np.inf), axis=1), middle, axis=1)
+        wild &= fit.square > _WILD**2 * median
+    return wild
 
 
 def _nothing(N: int, P: int, units: str) -> Lifted:

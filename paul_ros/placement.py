@@ -16,6 +16,8 @@ import numpy as np
 from msg_adapters.keypoints import Intrinsics
 
 _HALF_FIELD = 0.5  # cosine of 60 degrees
+_EYE = np.eye(3)
+_AXIS, _ABOUT_AXIS = _EYE[2], np.array([-1.0, -1.0, 1.0])  # half a turn about it, times the columns of a rotation
 
 
 @dataclass(frozen=True)
@@ -25,10 +27,12 @@ class CentredView:
     Attributes:
         W: (N,2,P) normalised image points (unit focal length) in the virtual cameras; NaN where hidden, or farther than
             60 degrees from the person's direction: taken for a misdetection.
+        seen: (N,P) bool, where W is a number.
         turn: (N,3,3) rotations from the virtual cameras to the real one.
     """
 
     W: np.ndarray
+    seen: np.ndarray
     turn: np.ndarray
 
 
@@ -40,27 +44,29 @@ def centred_view(xy: np.ndarray, visible: np.ndarray, camera: Intrinsics) -> Cen
         visible: (N,P) bool, at least one point a person.
         camera: pinhole intrinsics in pixels.
     """
-    rays = np.ones((*xy.shape[:2], 3))
-    rays[..., 0], rays[..., 1] = (xy[..., 0] - camera.cx) / camera.fx, (xy[..., 1] - camera.cy) / camera.fy
-    np.copyto(rays, 0.0, where=~visible[..., None])
+    rays = np.ones((len(xy), 3, xy.shape[1]))
+    rays[:, 0], rays[:, 1] = (xy[..., 0] - camera.cx) / camera.fx, (xy[..., 1] - camera.cy) / camera.fy
+    np.copyto(rays, 0.0, where=~visible[:, None])
     # Unit rays, so that one wild detection cannot turn the camera away from all the others.
-    length = np.maximum(np.sqrt((rays * rays).sum(2, keepdims=True)), 1.0)
-    towards = (rays / length).sum(1)
+    length = np.maximum(np.sqrt((rays * rays).sum(1, keepdims=True)), 1.0)
+    towards = (rays / length).sum(2)
     turn = _turn_from_axis(towards / np.sqrt((towards * towards).sum(1, keepdims=True)))
-    seen = (rays @ turn).transpose(0, 2, 1)
+    X = turn.transpose(0, 2, 1) @ rays
     # Of a hidden point all three are 0, which is not within the field.
-    inside = seen[:, 2] > _HALF_FIELD * length[..., 0]
-    with np.errstate(all="ignore"):
-        return CentredView(np.where(inside[:, None], seen[:, :2] / seen[:, 2:], np.nan), turn)
+    seen = X[:, 2:] > _HALF_FIELD * length
+    W = np.full(X[:, :2].shape, np.nan)
+    np.divide(X[:, :2], X[:, 2:], out=W, where=seen)
+    return CentredView(W, seen[:, 0], turn)
 
 
 def _turn_from_axis(direction: np.ndarray) -> np.ndarray:
-    """Smallest rotations (N,3,3) that take the optical axis (0,0,1) to unit directions (N,3) with z > 0."""
-    x, y, z = direction.T
-    k = 1.0 / (1.0 + z)
-    kxy = -k * x * y
-    turn = np.array([1 - k * x * x, kxy, x, kxy, 1 - k * y * y, y, -x, -y, z])
-    return turn.T.reshape(-1, 3, 3)
+    """Smallest rotations (N,3,3) that take the optical axis (0,0,1) to unit directions (N,3) with z > 0.
+
+    Half a turn about the axis, then half a turn about the middle m between the two: ``2 m m^T - 1`` for m of length 1.
+    """
+    middle = direction + _AXIS
+    about_middle = middle[:, :, None] * middle[:, None] / middle[:, 2:, None] - _EYE
+    return about_middle * _ABOUT_AXIS
 
 
 def place(shape: np.ndarray, turn: np.ndarray, metres_per_unit: np.ndarray | float) -> np.ndarray:
