@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Human models on motion capture that none of them was trained on, seen as robots see people: the model card's figures.
 
-    python benchmarks/human_model.py CMU_FOLDER [--models human_coco17,other.npz] [--json F] [--plot F.png] [--trials]
+    python benchmarks/human_model.py CMU_FOLDER [--models human,other.npz] [--json F] [--plot F.png] [--trials]
 
 Frames of the held-out trials, evenly chosen from each, every one from a camera of its own (training/view_settings.py,
 but whole in the image and of the captured people's own proportions), lifted one by one with the camera's intrinsics.

@@ -23,6 +23,7 @@ from paul_ros.model import load_model
 from paul_ros.onp import OnP, onp
 from paul_ros.placement import centred_view, place
 from paul_ros.refine import refine
+from paul_ros.skeleton import load_layout
 
 HERE = Path(__file__).resolve().parent
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)
@@ -77,7 +78,10 @@ def figures(truth: np.ndarray, known: bool) -> list[list[float]]:
     xy, visible = pixels(truth), np.ones(truth.shape[:2], bool)
     view = centred_view(xy, visible, CAMERA)
     visible &= np.isfinite(view.W).all(1)
-    S = model.shape(view.W, visible).astype(float)
+    own = [model.layout.names.index(name) for name in load_layout("coco17").names]
+    W, seen = np.zeros((len(truth), 2, len(model.layout.names))), np.zeros((len(truth), len(model.layout.names)), bool)
+    W[:, :, own], seen[:, own] = np.nan_to_num(view.W), visible
+    S = model.shape(W, seen)[:, :, own].astype(float)
     if known:
         S = truth.transpose(0, 2, 1) / model.metres_per_unit
         S = S - S.mean(2, keepdims=True)

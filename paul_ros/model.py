@@ -27,7 +27,7 @@ from paul_ros.files import write_atomically
 from paul_ros.skeleton import Layout, LayoutError, Part
 
 FORMAT_VERSION = 1
-DEFAULT_MODEL = "human_coco17"
+DEFAULT_MODEL = "human"
 RESIDUAL, CONVOLUTIONAL = "residual", "convolutional"
 """The kinds of 2D encoders."""
 _DIGEST_CHARS = 64

@@ -33,7 +33,7 @@ PARAMETERS = (
     ),
     Parameter(
         "model",
-        "human_coco17",
+        "human",
         "Model file: the name of one that is shipped, or a path to a .npz, which is read anew each time it is set.",
         live=True,
     ),

@@ -135,6 +135,25 @@ def model_file(tmp_path_factory) -> Path:
     return path
 
 
+def coco_model():
+    """The shipped model as one of COCO-17 alone: its weights for the other points left out."""
+    from paul_ros.model import Model, load_model, to_unit_size
+    from paul_ros.skeleton import load_layout
+
+    human, coco = load_model(), load_layout("coco17")
+    own = np.array([human.layout.names.index(name) for name in coco.names])
+    rows = np.concatenate([part * len(human.layout.names) + own for part in range(3)])
+    last = len(human.header["architecture"]["decoder"]["hidden"])
+    weights = {**human.weights, "encoder.input.weight": human.weights["encoder.input.weight"][:, rows]}
+    for name in (f"decoder.{last}.weight", f"decoder.{last}.bias"):
+        weights[name] = human.weights[name][rows]
+    mean = to_unit_size(human.mean_shape[None, :, own], coco)[0]
+    unit = np.ptp(human.mean_shape[1, own]) / np.ptp(mean[1])  # its edges have another mean length
+    header = {**human.header, "layout": coco.to_dict(), "misfit": human.misfit / unit}
+    header["metres_per_unit"] = human.metres_per_unit * float(unit)
+    return Model("coco", header, coco, weights, mean, human.sha256)
+
+
 def persons_at(*places) -> np.ndarray:
     """(N, 17, 3) metres: PERSON at each (x, y, z)."""
     return PERSON + np.array(places, dtype=float).reshape(-1, 1, 3)

@@ -13,7 +13,7 @@ from tiny_data import FROM_RANDOM_WEIGHTS
 
 from paul_ros.lifter import TOO_FEW_POINTS, Lifter
 from paul_ros.model import load_model
-from paul_ros.skeleton import Layout, anonymous_layout
+from paul_ros.skeleton import Layout, anonymous_layout, load_layout
 from training import cli
 from training.categories import among_categories, joint_layout, load_files
 from training.data import DataError
@@ -93,7 +93,7 @@ def test_joint_layouts_keep_what_their_parts_say(sizes, data):
 def test_sides_and_rules_go_with_their_category(tmp_path):
     person = write(tmp_path / "person.npz", 17)
     data = load_files([write(tmp_path / "box.npz", 4, seed=3), person])
-    coco = load_model().layout
+    coco = load_layout("coco17")
     assert data.layout.left_right == tuple((a + 4, b + 4) for a, b in coco.left_right)
     assert data.layout.handedness[0].left == tuple(point + 4 for point in coco.handedness[0].left)
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from conftest import coco_model
 from scipy.spatial.transform import Rotation
 
 from paul_ros.model import load_model
@@ -94,7 +95,7 @@ def test_the_final_loss_is_the_one_that_ranked_the_run(data, tmp_path):
 
 def test_chirality_is_known_only_if_every_category_has_a_rule():
     coco = load_layout("coco17")
-    shapes = np.repeat(load_model().mean_shape[None].astype(float), 3, axis=0)
+    shapes = np.repeat(coco_model().mean_shape[None].astype(float), 3, axis=0)
     assert export._chirality(shapes, shapes[0], coco, 1.0)["known"]
     both = np.concatenate([shapes, shapes], axis=2)
     assert export._chirality(both, both[0], joint_layout(["a", "b"], [coco, coco]), 1.0)["known"]

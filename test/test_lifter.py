@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import persons_at
+from conftest import coco_model, persons_at
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.keypoints import Intrinsics
@@ -18,7 +18,7 @@ CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)
 
 @pytest.fixture(scope="module")
 def model():
-    return load_model()
+    return replace(coco_model(), header={**coco_model().header, "misfit": None})
 
 
 @pytest.fixture(scope="module")

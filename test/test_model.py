@@ -241,7 +241,7 @@ def test_weights_that_are_not_finite_are_not_saved(tmp_path):
 
 
 def test_unknown_models_are_named_with_the_known_ones():
-    with pytest.raises(ModelError, match="did you mean 'human_coco17'"):
+    with pytest.raises(ModelError, match="did you mean 'human'"):
         load_model("human_coco")
     with pytest.raises(ModelError, match="shipped models"):
         load_model("/nowhere/x.npz")
@@ -278,10 +278,12 @@ def test_rigid_model_always_answers_the_mean(saved):
 
 
 def test_shipped_human_model():
-    assert "human_coco17" in model_names()
+    assert "human" in model_names()
     model: Model = load_model()
-    assert model.layout.names == LAYOUT.names and model.header["chirality"]["known"]
-    assert 0.2 < model.metres_per_unit < 0.4
+    assert model.layout.names == load_layout("human").names and model.header["chirality"]["known"]
+    head, foot = (model.mean_shape[:, model.layout.names.index(name)] for name in ("head_top", "left_heel"))
+    assert 1.5 < model.metres_per_unit * np.linalg.norm(head - foot) < 1.9
+    assert model.stature == 1.7 and 0.01 < model.misfit * model.metres_per_unit < 0.05
     assert model.header["training"]["command"].startswith("paul train")
     json.dumps(model.header)
 

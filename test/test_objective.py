@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from conftest import coco_model
 from scipy.spatial.transform import Rotation
 from tiny_data import sequence
 
-from paul_ros.model import load_model
 from paul_ros.skeleton import load_layout
 from training.networks import build_networks
 from training.objective import (
@@ -160,7 +160,7 @@ def test_the_default_weights_are_the_earlier_ones_times_the_root_of_17():
     """Before, distances were divided by the root of the number of points: training for 17 points is the same."""
     recipe = Recipe()
     networks = build_networks(COCO, recipe, 8)
-    W = torch.from_numpy(100 * load_model().mean_shape[None, :2] + np.random.default_rng(0).normal(0, 9, (8, 2, 17)))
+    W = torch.from_numpy(100 * coco_model().mean_shape[None, :2] + np.random.default_rng(0).normal(0, 9, (8, 2, 17)))
     views = batch(W.float(), torch.ones(8, 17, dtype=torch.bool))
     terms, found = paul_terms(networks, COCO, recipe, views, ROWS), fit(networks, recipe, views, ROWS)
     per_point = [(S - found.points).square().sum((1, 2)).div(17).sqrt().mean() for S in found.streams]
@@ -220,14 +220,14 @@ def test_undone_perspective_is_weak_perspective(facing):
 
 
 def test_handedness_tells_a_body_from_its_mirror_image():
-    S = torch.from_numpy(load_model().mean_shape)[None]
+    S = torch.from_numpy(coco_model().mean_shape)[None]
     mirrored = S * torch.tensor([1.0, 1.0, -1.0])[:, None]
     assert handedness_violation(S, COCO) == 0
     assert handedness_violation(mirrored, COCO) > 0.5
 
 
 def test_bone_variation_is_zero_for_one_body_in_any_orientation():
-    S = torch.from_numpy(load_model().mean_shape).double()
+    S = torch.from_numpy(coco_model().mean_shape).double()
     S = (S + S[:, COCO.mirror] * torch.tensor([-1.0, 1.0, 1.0])[:, None]) / 2
     turned = torch.from_numpy(Rotation.random(5, random_state=0).as_matrix()) @ S
     assert bone_variation(turned, COCO) < 1e-10
@@ -235,7 +235,7 @@ def test_bone_variation_is_zero_for_one_body_in_any_orientation():
 
 
 def test_lopsided_bodies_are_told_from_symmetric_ones():
-    S = torch.from_numpy(load_model().mean_shape).double()[None]
+    S = torch.from_numpy(coco_model().mean_shape).double()[None]
     symmetric = (S + S[:, :, COCO.mirror] * torch.tensor([-1.0, 1.0, 1.0])[:, None]) / 2
     lopsided = symmetric.clone()
     lopsided[:, :, COCO.names.index("left_shoulder")] += 0.5

@@ -138,7 +138,7 @@ def test_scaled_prediction_shows_in_ne_but_not_in_n_mpjpe(short, model_file):
     assert report["ne_flip_frame_percent"] == pytest.approx(25)
 
 
-@pytest.mark.parametrize("bag, most_mm", [(ONE, 62), (TWO, 50)], ids=["one", "two"])
+@pytest.mark.parametrize("bag, most_mm", [(ONE, 58), (TWO, 45)], ids=["one", "two"])
 def test_the_shipped_model_keeps_its_word(bag, most_mm):
     """The main figures: shape at least halves the error of a rigid model, and left is never taken for right."""
     report = evaluate(replay(bag, open_stream()))
@@ -149,7 +149,7 @@ def test_the_shipped_model_keeps_its_word(bag, most_mm):
 
 def test_the_shipped_models_are_small():
     files = list((ROOT / "paul_ros" / "models").glob("*.npz"))
-    assert files and all(file.stat().st_size <= 4_000_000 for file in files)
+    assert files and all(file.stat().st_size <= 8_000_000 for file in files)
 
 
 @pytest.fixture

@@ -141,15 +141,15 @@ def test_interpolation_draws_the_line_between_two_codes(model_file, tmp_path, ca
     S = random_rotations(10, 0) @ shapes
     np.savez(tmp_path / "seen.npz", W=S[:, :2], S=S)
     file = [str(tmp_path / "seen.npz")]
-    report = study("interpolation", file, tmp_path, "--model", "human_coco17", "--frames", "2,5")
+    report = study("interpolation", file, tmp_path, "--model", "human", "--frames", "2,5")
     (line,) = report["rows"]
     assert line["frames"] == [2, 5] and len(line["changes_percent"]) == 8
-    ends = model.shape(S[[2, 5], :2], np.ones((2, 17), bool))
+    ends = model.shape(S[[2, 5], :2], np.ones((2, 43), bool))
     size = line["ends_apart_percent"] / 100
     assert sum(line["changes_percent"]) / 100 >= size > 0
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(size * np.linalg.norm(ends, axis=(1, 2)).mean(), rel=0.1)
-    (other,) = study("interpolation", file, tmp_path, "--model", "human_coco17")["rows"]
-    codes = model.encode(S[:, :2], np.ones((10, 17), bool))
+    (other,) = study("interpolation", file, tmp_path, "--model", "human")["rows"]
+    codes = model.encode(S[:, :2], np.ones((10, 43), bool))
     apart = np.linalg.norm(codes[:, None] - codes, axis=2)
     assert apart[tuple(other["frames"])] == apart.max()
 
@@ -211,10 +211,10 @@ def test_interpolation_needs_no_truth_and_names_frames_that_do_not_count(tmp_pat
 
 
 def test_interpolation_needs_no_torch(tmp_path):
-    S = np.random.default_rng(0).standard_normal((3, 3, 17))
+    S = np.random.default_rng(0).standard_normal((3, 3, 43))
     np.savez(tmp_path / "seen.npz", W=S[:, :2], S=S)
     code = "import sys\nfrom paul_ros import cli\nassert cli.main(sys.argv[1:]) == 0\nassert 'torch' not in sys.modules"
-    words = ["study", "interpolation", "--model", "human_coco17", "--data", tmp_path / "seen.npz", "-o", tmp_path]
+    words = ["study", "interpolation", "--model", "human", "--data", tmp_path / "seen.npz", "-o", tmp_path]
     done = subprocess.run([sys.executable, "-c", code, *words], cwd=ROOT, capture_output=True)
     assert done.returncode == 0, done.stderr
 

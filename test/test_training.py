@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import coco_model
 from scipy.spatial.transform import Rotation
 from tiny_data import FROM_RANDOM_WEIGHTS
 
@@ -50,7 +51,7 @@ def one_thread():
 def views(count=40, seed=0):
     """2D views (F,2,17) in pixels and the 3D truth (F,3,17), of bodies that vary a little about the shipped mean."""
     rng = np.random.default_rng(seed)
-    S = load_model().mean_shape + 0.1 * rng.standard_normal((count, 3, 17))
+    S = coco_model().mean_shape + 0.1 * rng.standard_normal((count, 3, 17))
     S = Rotation.random(count, random_state=seed).as_matrix() @ S
     return (100 * S[:, :2] + 300).astype(np.float32), S.astype(np.float32)
 

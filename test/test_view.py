@@ -68,10 +68,10 @@ def test_a_bag_as_gif(tmp_path, model_file, capsys):
 
 def test_a_model_as_png(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["view", "human_coco17", "-o", "model.png"]) == 0
+    assert cli.main(["view", "human", "-o", "model.png"]) == 0
     picture = np.asarray(Image.open("model.png"))
     assert picture.shape == (4 * 500, 900, 3)
-    assert "mean shape and 3 modes of its 12 codes" in capsys.readouterr().out
+    assert "mean shape and 3 modes of its 16 codes" in capsys.readouterr().out
 
 
 def test_the_name_of_the_film_is_the_bags(tmp_path, model_file, monkeypatch):
@@ -177,7 +177,7 @@ def test_a_model_is_seen_from_the_front(model_file):
 
 def test_modes_of_codes():
     mean, modes, shares = view.code_modes(load_model())
-    assert mean.shape == (12,) and modes.shape == (3, 12)
+    assert mean.shape == (16,) and modes.shape == (3, 16)
     np.testing.assert_allclose((modes @ modes.T)[~np.eye(3, dtype=bool)], 0, atol=1e-9)
     assert (np.diff(shares) < 0).all() and 0 < shares.sum() <= 1
 
@@ -200,13 +200,13 @@ def test_grid(radius, spacing):
 
 
 def test_other_formats_are_refused(tmp_path, capsys):
-    assert cli.main(["view", "human_coco17", "-o", str(tmp_path / "film.avi")]) == 1
+    assert cli.main(["view", "human", "-o", str(tmp_path / "film.avi")]) == 1
     assert "must end in .gif, .mp4, .png" in capsys.readouterr().err
 
 
 def test_mp4_without_ffmpeg(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert cli.main(["view", "human_coco17", "-o", str(tmp_path / "film.mp4")]) == 1
+    assert cli.main(["view", "human", "-o", str(tmp_path / "film.mp4")]) == 1
     assert "ffmpeg, which is not there; choose a name ending in .gif" in capsys.readouterr().err
 
 
@@ -233,7 +233,7 @@ def test_mp4_by_ffmpeg(tmp_path, monkeypatch, fails):
 
 def test_without_matplotlib(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert cli.main(["view", "human_coco17", "-o", str(tmp_path / "film.png")]) == 1
+    assert cli.main(["view", "human", "-o", str(tmp_path / "film.png")]) == 1
     assert "matplotlib: pip install 'paul_ros[bags]'" in capsys.readouterr().err
 
 
