@@ -274,7 +274,7 @@ def load_model(name_or_path: str | os.PathLike = DEFAULT_MODEL) -> Model:
     try:
         arrays = _read_arrays(data)
         header = json.loads(bytes(arrays.pop("header")).decode())
-    except (KeyError, ValueError, OSError, RecursionError, zipfile.BadZipFile) as error:
+    except Exception as error:  # zipfile, zlib, numpy and json report what they cannot read in a dozen ways
         raise ModelError(f"{where} is no model file: {error}") from error
     if not isinstance(header, dict):
         raise ModelError(f"{where} is no model file: its header is a {type(header).__name__}, not an object")

@@ -17,7 +17,7 @@ from typing import Callable
 import numpy as np
 
 import msg_adapters
-from msg_adapters import Intrinsics, Keypoints2D
+from msg_adapters import Intrinsics, Keypoints2D, MessageError
 from msg_adapters.keypoints import stamp_ns
 from paul_ros import __version__, metrics
 from paul_ros.bag import (
@@ -169,18 +169,35 @@ class _Shell:
             self._take_keypoints(record)
             return True
         if record.topic == self.topics.camera_info:
-            self.done.stream.camera_info(_decoded(record, "camera info", CAMERA_INFO))
+            self._hand(record, "camera info", self.done.stream.camera_info, CAMERA_INFO)
         elif record.topic == self.topics.depth:
-            self.done.stream.depth(_decoded(record, "depth", DEPTH_IMAGE))
+            self._hand(record, "depth", self.done.stream.depth, DEPTH_IMAGE)
         else:
-            self._take_truth(_decoded(record, "ground truth", POSE_ARRAY))
+            self._hand(record, "ground truth", self._take_truth, POSE_ARRAY)
         return False
+
+    def _hand(self, record: Record, role: str, take: Callable[[object], None], *readable: str) -> None:
+        """Decodes and takes; bytes that are no message are a counted drop. Raises WrongTopic."""
+        if record.type_name not in readable:
+            raise WrongTopic(
+                f"{record.topic} is a {record.type_name}, not readable as {role} ({' or '.join(readable)} is): "
+                f"choose another with {_OPTIONS[role]}"
+            )
+        try:
+            message = record.message()
+        except BagError as error:
+            with self.done.stream.guard():
+                raise MessageError("undecodable", str(error)) from error
+        else:
+            take(message)
 
     def _take_keypoints(self, record: Record) -> None:
         self.keypoint_messages += 1
-        message = _decoded(record, "keypoints", *msg_adapters.SUPPORTED)
-        frame = self.done.stream.keypoints(record.type_name, message, record.topic)
         self._last_time = record.log_time
+        self._hand(record, "keypoints", lambda message: self._lift(record, message), *msg_adapters.SUPPORTED)
+
+    def _lift(self, record: Record, message: object) -> None:
+        frame = self.done.stream.keypoints(record.type_name, message, record.topic)
         self._write_layout(record.log_time)
         self._take_frame(frame)
 
@@ -220,15 +237,6 @@ class _Shell:
             self._described = described
             message = self._make("std_msgs/msg/String", data=json.dumps(described))
             self.writer.write(f"{NODE}/layout", message, log_time, LATCHED_QOS)
-
-
-def _decoded(record: Record, role: str, *readable: str) -> object:
-    if record.type_name not in readable:
-        raise WrongTopic(
-            f"{record.topic} is a {record.type_name}, not readable as {role} ({' or '.join(readable)} is): "
-            f"choose another with {_OPTIONS[role]}"
-        )
-    return record.message()
 
 
 def _nothing_there(bag: Path, topics: Topics) -> str:

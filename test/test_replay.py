@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -446,3 +447,19 @@ def test_the_filter_works_in_replay_as_in_the_stream(short, model_file, tmp_path
     for (_, _, message, _), frame in zip(read_messages(tmp_path / "0.5.mcap", ["/lifter/bodies"]), calm.frames):
         roots = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses]).reshape(-1, 3)
         np.testing.assert_allclose(roots, frame.lifted.points[frame.lifted.ok][:, [11, 12]].mean(1))
+
+
+def test_bytes_that_are_no_message_are_a_counted_drop(model_file, tmp_path):
+    """They cost themselves, not what comes after them."""
+
+    def cut(record):
+        return replace(record, data=record.data[:30]) if 0.2e9 < record.log_time % 1e9 < 0.3e9 else record
+
+    broken, whole = (
+        part_of(ONE, tmp_path / f"{name}.mcap", 3, how) for name, how in (("cut", cut), ("all", lambda r: r))
+    )
+    done, all_of_it = replay(broken, open_stream(model_file)), replay(whole, open_stream(model_file))
+    drops = done.stream.drops["undecodable"]
+    assert drops > 5 and done.damage is None and "does not decode" in done.stream.explanations["undecodable"]
+    lost = len(all_of_it.frames) - len(done.frames)
+    assert 3 < lost <= drops and done.frames[-1].stamp == all_of_it.frames[-1].stamp
