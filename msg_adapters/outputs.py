@@ -13,6 +13,7 @@ import numpy as np
 
 _FLOAT32 = 7
 _SPHERE_LIST, _LINE_LIST = 7, 5
+_ANNOTATED_POINTS, _ANNOTATED_LINES = 1, 4
 _ADD, _DELETE = 0, 2
 _MARKER_SECONDS = 1
 #: Up to here float32 holds every whole number.
@@ -101,6 +102,49 @@ def skeleton_markers(make, header, points: np.ndarray, observed: np.ndarray, edg
     return make("visualization_msgs/msg/MarkerArray", markers=[lines, spheres])
 
 
+def body_transforms(make, header, ids, positions: np.ndarray, quaternions: np.ndarray):
+    """tf2_msgs/TFMessage from the header's frame to body_ID (REP-155) of every person that has an id, '' being none.
+
+    positions (N, 3) metres; quaternions (N, 4) as x, y, z, w.
+    """
+    transforms = [
+        make(
+            "geometry_msgs/msg/TransformStamped",
+            header=header,
+            child_frame_id=f"body_{ident}",
+            transform=make(
+                "geometry_msgs/msg/Transform",
+                translation=_vector(make, *xyz),
+                rotation=_quaternion(make, *xyzw),
+            ),
+        )
+        for ident, xyz, xyzw in zip(ids, positions.tolist(), quaternions.tolist())
+        if ident
+    ]
+    return make("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+
+def image_annotations(make, header, pixels: np.ndarray, observed: np.ndarray, edges, sides):
+    """foxglove_msgs/ImageAnnotations: bones and keypoints of all persons, drawn into the camera's image.
+
+    pixels (N, P, 2), whole numbers at the middle of a pixel as in CameraInfo, NaN where there is nothing to draw;
+    observed (N, P) bool, what was not is drawn faint; edges, sides: see skeleton_markers. Of the message only `points`
+    is given: its other fields are empty, and are not the same in all releases of the package.
+    """
+    edges = np.asarray(edges, dtype=int).reshape(-1, 2)
+    ends = pixels[:, edges]
+    drawn = np.isfinite(ends).all(axis=(2, 3))
+    palette = {key: _colour(make, rgb, alpha, "foxglove_msgs/msg/Color") for key, rgb, alpha in _tones()}
+    bone_sides = [sides[a] if sides[a] == sides[b] else "" for a, b in edges]
+    bones_seen = observed[:, edges].all(axis=-1)
+    shown = np.isfinite(pixels).all(axis=2)
+    of_bones = [palette[bone_sides[bone], bool(bones_seen[n, bone])] for n, bone in np.argwhere(drawn)]
+    of_points = [palette[str(sides[point]), bool(observed[n, point])] for n, point in np.argwhere(shown)]
+    lines = _annotation(make, header, _ANNOTATED_LINES, ends[drawn].reshape(-1, 2), of_bones, 2.0)
+    dots = _annotation(make, header, _ANNOTATED_POINTS, pixels[shown], of_points, 6.0)
+    return make("foxglove_msgs/msg/ImageAnnotations", points=[lines, dots])
+
+
 def id_numbers(ids) -> np.ndarray:
     """Person ids as numbers a float32 field can carry: -1 for '', the row for an id that is no whole number.
 
@@ -156,7 +200,7 @@ def _marker(make, header, index: int, name: str, kind: int, size: float, points:
         type=kind,
         action=_ADD if len(points) else _DELETE,
         pose=make("geometry_msgs/msg/Pose", position=_point(make, (0.0, 0.0, 0.0)), orientation=_quaternion(make)),
-        scale=make("geometry_msgs/msg/Vector3", x=float(size), y=float(size), z=float(size)),
+        scale=_vector(make, *(3 * (float(size),))),
         color=_colour(make, SIDE_COLOURS[""], _OBSERVED_ALPHA),
         lifetime=seconds,
         frame_locked=False,
@@ -174,11 +218,27 @@ def _marker(make, header, index: int, name: str, kind: int, size: float, points:
 
 def _palette(make) -> dict:
     """(side, observed) -> colour message; shared by all points, which is what makes many points cheap."""
-    return {
-        (side, observed): _colour(make, rgb, _OBSERVED_ALPHA if observed else _HIDDEN_ALPHA)
-        for side, rgb in SIDE_COLOURS.items()
-        for observed in (True, False)
-    }
+    return {key: _colour(make, rgb, alpha) for key, rgb, alpha in _tones()}
+
+
+def _tones():
+    """(side, observed), its colour, its opacity."""
+    for side, rgb in SIDE_COLOURS.items():
+        yield (side, True), rgb, _OBSERVED_ALPHA
+        yield (side, False), rgb, _HIDDEN_ALPHA
+
+
+def _annotation(make, header, kind: int, pixels: np.ndarray, colours: list, thickness: float):
+    # The origin is the corner of the first pixel there, its middle in CameraInfo.
+    corner = (pixels + 0.5).tolist()
+    return make(
+        "foxglove_msgs/msg/PointsAnnotation",
+        timestamp=header.stamp,
+        type=kind,
+        points=[make("foxglove_msgs/msg/Point2", x=x, y=y) for x, y in corner],
+        outline_colors=colours,
+        thickness=thickness,
+    )
 
 
 def _colours(palette: dict, sides, observed: np.ndarray) -> list:
@@ -186,12 +246,16 @@ def _colours(palette: dict, sides, observed: np.ndarray) -> list:
     return [palette[str(sides[index % len(sides)]), seen] for index, seen in enumerate(observed.tolist())]
 
 
-def _colour(make, rgb, alpha: float):
-    return make("std_msgs/msg/ColorRGBA", r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
+def _colour(make, rgb, alpha: float, kind: str = "std_msgs/msg/ColorRGBA"):
+    return make(kind, r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
 
 
 def _point(make, xyz):
     return make("geometry_msgs/msg/Point", x=xyz[0], y=xyz[1], z=xyz[2])
+
+
+def _vector(make, x: float, y: float, z: float):
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
 def _quaternion(make, x: float = 0.0, y: float = 0.0, z: float = 0.0, w: float = 1.0):

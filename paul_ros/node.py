@@ -53,7 +53,7 @@ from paul_ros.ros import (
     unhearing,
 )
 from paul_ros.skeleton import LayoutError
-from paul_ros.stream import OUTPUTS, Frame, LiftStream, open_stream
+from paul_ros.stream import OPTIONAL, OUTPUTS, Frame, LiftStream, open_stream
 
 _LOOK_SECONDS = 0.05
 _REPORT_SECONDS = 1.0
@@ -203,8 +203,25 @@ class LifterNode(LifecycleNode):
         self._outputs = {
             name: self._publisher(message_class(type_name), f"~/{name}") for name, type_name in OUTPUTS.items()
         }
+        self._outputs.update(self._optional_outputs())
         self._layout = self._publisher(String, "~/layout", latched_qos())
         self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics")
+
+    def _optional_outputs(self) -> dict:
+        """Name -> publisher. Raises ValueError where a parameter asks for what is not installed."""
+        made = {}
+        if self._values["publish_tf"]:
+            try:
+                made["transforms"] = self._publisher(message_class(OPTIONAL["transforms"]), "/tf")
+            except ImportError as error:
+                raise ValueError(
+                    f"publish_tf needs tf2_msgs, which cannot be imported ({error}); install it"
+                ) from error
+        try:
+            made["annotations"] = self._publisher(message_class(OPTIONAL["annotations"]), "~/annotations")
+        except ImportError:
+            self.get_logger().info("no ~/annotations: foxglove_msgs is not installed")
+        return made
 
     def _activate(self) -> None:
         self._health = Health(time.monotonic())

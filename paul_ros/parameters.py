@@ -72,6 +72,12 @@ PARAMETERS = (
         (0.0, 100.0),
         live=True,
     ),
+    Parameter(
+        "publish_tf",
+        False,
+        "Publish on /tf the pose of ~/bodies as body_ID, of every person with an id (REP-155); it needs tf2_msgs, and "
+        "metres.",
+    ),
     Parameter("min_confidence", 0.3, "Keypoints with a lower confidence count as hidden.", (0.0, 1.0), live=True),
     Parameter(
         "max_persons", 64, "Messages with more persons are dropped, counted as too_many_persons.", (1, 10000), live=True

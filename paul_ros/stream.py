@@ -47,7 +47,7 @@ class Frame:
 
     header: the input's own header; keypoints: its N persons, hidden what was not used; lifted: their 3D, both in the
     layout of the output; attitudes: (N,4) quaternions of the body axes; given: the keypoints in the model's layout, low
-    confidences hidden; bone_width in the units of the points.
+    confidences hidden; bone_width in the units of the points; camera: its intrinsics, None where they are not known.
     """
 
     header: object
@@ -57,9 +57,10 @@ class Frame:
     attitudes: np.ndarray
     given: Keypoints2D
     bone_width: float
+    camera: Intrinsics | None
 
     def message(self, output: str, make):
-        """One output message by name, of OUTPUTS; persons that were not lifted are left out."""
+        """One output message by name, of OUTPUTS or OPTIONAL; persons that were not lifted are left out."""
         return getattr(self, "_" + output)(make, self.lifted.ok)
 
     def messages(self, make) -> dict:
@@ -96,6 +97,18 @@ class Frame:
             self.bone_width,
         )
 
+    def _transforms(self, make, ok: np.ndarray):
+        # Frames are in metres (REP-103): of model units there are none.
+        ok = ok & (self.lifted.units == "m")
+        ids = [ident for ident, good in zip(self.keypoints.ids, ok) if good]
+        return outputs.body_transforms(make, self.header, ids, self.lifted.root[ok], self.attitudes[ok])
+
+    def _annotations(self, make, ok: np.ndarray):
+        ok = ok & (self.lifted.units == "m")
+        pixels = project(self.lifted.points[ok], self.camera)
+        visible, layout = self.keypoints.visible[ok], self.layout
+        return outputs.image_annotations(make, self.header, pixels, visible, layout.edges, layout.sides)
+
 
 #: Output name -> type name of its message.
 OUTPUTS = {
@@ -104,6 +117,23 @@ OUTPUTS = {
     "keypoints3d": "sensor_msgs/msg/PointCloud2",
     "markers": "visualization_msgs/msg/MarkerArray",
 }
+
+#: The same of those that the node publishes only where it is asked to, or has the package.
+OPTIONAL = {
+    "transforms": "tf2_msgs/msg/TFMessage",
+    "annotations": "foxglove_msgs/msg/ImageAnnotations",
+}
+
+
+def project(points: np.ndarray, camera: Intrinsics | None) -> np.ndarray:
+    """Points (...,3) of the camera's frame as pixels (...,2); NaN for those behind it, and without a camera."""
+    pixels = np.full((*points.shape[:-1], 2), np.nan)
+    if camera is None:
+        return pixels
+    ahead = points[..., 2] > 0
+    x, y, z = points[ahead].T
+    pixels[ahead] = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    return pixels
 
 
 def open_stream(model: str | None = None, layout: str | None = None, **parameters) -> LiftStream:
@@ -343,6 +373,7 @@ class LiftStream:
             self._steady(given.ids, quaternions(axes)),
             given,
             width,
+            self.intrinsics,
         )
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:

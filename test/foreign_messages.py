@@ -27,6 +27,7 @@ DEFINITIONS = {
     YOLO: "std_msgs/Header header\nyolo_msgs/Detection[] detections\n",
     "hri_msgs/msg/NormalizedPointOfInterest2D": "float32 x\nfloat32 y\nfloat32 c\n",
     HRI: "std_msgs/Header header\nhri_msgs/NormalizedPointOfInterest2D[18] skeleton\n",
+    "hri_msgs/msg/IdsList": "std_msgs/Header header\nstring[] ids\n",
     "zed_msgs/msg/Keypoint2Df": "float32[2] kp\n",
     "zed_msgs/msg/Skeleton2D": "zed_msgs/Keypoint2Df[70] keypoints\n",
     "zed_msgs/msg/Object": "string label\nint16 label_id\nfloat32 confidence\nbool skeleton_available\n"
@@ -46,6 +47,15 @@ DEFINITIONS = {
     "ros_openpose/msg/Person": "ros_openpose/BodyPart[] bodyParts\nros_openpose/BodyPart[] leftHandParts\n"
     "ros_openpose/BodyPart[] rightHandParts\n",
     OPENPOSE_FRAME: "std_msgs/Header header\nros_openpose/Person[] persons\n",
+    # What the node publishes where these are installed.
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
+    "foxglove_msgs/msg/Color": "float64 r\nfloat64 g\nfloat64 b\nfloat64 a\n",
+    "foxglove_msgs/msg/Point2": "float64 x\nfloat64 y\n",
+    "foxglove_msgs/msg/PointsAnnotation": "builtin_interfaces/Time timestamp\nuint8 type\n"
+    "foxglove_msgs/Point2[] points\n"
+    "foxglove_msgs/Color outline_color\nfoxglove_msgs/Color[] outline_colors\nfoxglove_msgs/Color fill_color\n"
+    "float64 thickness\n",
+    "foxglove_msgs/msg/ImageAnnotations": "foxglove_msgs/PointsAnnotation[] points\n",
 }
 
 SIZE = (640, 480)
