@@ -203,26 +203,26 @@ class Mapping:
         self._check(xy, confidence, visible)
         if self.source.names == self.target.names:
             return xy, confidence, visible
-        shape = len(xy), len(self.sources)
-        mapped = np.full((*shape, 2), np.nan), np.zeros(shape), np.zeros(shape, dtype=bool)
-        points, copied = self._copied
-        for out, array in zip(mapped, (xy, confidence, visible)):
-            out[:, points] = array[:, copied]
-        for point, parts in self._means:
-            mapped[0][:, point] = xy[:, parts].mean(1)
-            mapped[1][:, point] = confidence[:, parts].mean(1)
-            mapped[2][:, point] = visible[:, parts].all(1)
+        seen = np.zeros((len(xy), len(self.sources)), dtype=bool)
+        for points, parts in self._groups:
+            seen[:, points] = visible[:, parts].all(1)
+        return self.values(xy), self.values(confidence, 0.0), seen
+
+    def values(self, array: np.ndarray, lacking: float = np.nan) -> np.ndarray:
+        """Values (N,P,...) of the source's points as those (N,Q,...) of the target's; `lacking` where there are none."""
+        if self.source.names == self.target.names:
+            return array
+        mapped = np.full((len(array), len(self.sources), *array.shape[2:]), lacking)
+        for points, parts in self._groups:
+            mapped[:, points] = array[:, parts].sum(1) / len(parts)
         return mapped
 
     @cached_property
-    def _copied(self) -> tuple[np.ndarray, np.ndarray]:
-        pairs = [(point, parts[0]) for point, parts in enumerate(self.sources) if len(parts) == 1]
-        points, copied = np.array(pairs, dtype=int).reshape(-1, 2).T
-        return points, copied
-
-    @cached_property
-    def _means(self) -> list[tuple[int, list[int]]]:
-        return [(point, list(parts)) for point, parts in enumerate(self.sources) if len(parts) > 1]
+    def _groups(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Target points (G,) that are means of k source points each, and these (k,G), for every such k."""
+        counts = np.array([len(parts) for parts in self.sources])
+        groups = [np.flatnonzero(counts == k) for k in np.unique(counts[counts > 0])]
+        return [(points, np.array([self.sources[point] for point in points]).T) for points in groups]
 
     def _check(self, xy: np.ndarray, confidence: np.ndarray, visible: np.ndarray) -> None:
         expected = len(xy), len(self.source.names)

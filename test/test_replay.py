@@ -16,7 +16,6 @@ from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_r
 from paul_ros.lifter import Lifter
 from paul_ros.replay import Topics, evaluate, flips, replay
 from paul_ros.report import PictureError, table, write_json, write_picture
-from paul_ros.route import map_points
 from paul_ros.skeleton import load_layout
 from paul_ros.stream import open_stream
 
@@ -266,7 +265,7 @@ def test_truth_in_another_layout():
     """COCO has no pelvis: it is the mean of the hips."""
     points = np.random.default_rng(0).normal(size=(2, 17, 3))
     h36m = load_layout("h36m17")
-    mapped = map_points(load_layout("coco17").map_to(h36m), points)
+    mapped = load_layout("coco17").map_to(h36m).values(points)
     assert np.allclose(mapped[:, h36m.names.index("pelvis")], points[:, 11:13].mean(1))
     assert np.allclose(mapped[:, h36m.names.index("left_knee")], points[:, 13])
     assert np.isnan(mapped).any()
