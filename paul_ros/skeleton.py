@@ -209,7 +209,7 @@ class Mapping:
         return self.values(xy), self.values(confidence, 0.0), seen
 
     def values(self, array: np.ndarray, lacking: float = np.nan) -> np.ndarray:
-        """Values (N,P,...) of the source's points as those (N,Q,...) of the target's; `lacking` where there are none."""
+        """Values (N,P,...) of the source's points as those (N,Q,...) of the target's; `lacking` where none are."""
         if self.source.names == self.target.names:
             return array
         mapped = np.full((len(array), len(self.sources), *array.shape[2:]), lacking)
