@@ -13,7 +13,7 @@ import pytest
 from compiled_messages import lacking
 from conftest import ROOT, RosMake, camera_info, persons_at, seen
 from foreign_messages import HRI, SIZE, YOLO, hri
-from test_node import Bench
+from node_bench import Bench
 
 from msg_adapters import hri as hri_adapter
 from paul_ros.skeleton import load_layout

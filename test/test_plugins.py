@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from compiled_messages import lacking
 from conftest import ROOT, RosMake, camera_info, header_of, persons_at, seen
-from test_node import Bench
+from node_bench import Bench
 
 import msg_adapters
 from msg_adapters import Adapter, Keypoints2D, MessageError, WrongPointCount, plugins, record
