@@ -12,6 +12,7 @@ import functools
 import logging
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,18 +47,23 @@ class Frame:
     """One lifted message.
 
     header: the input's own header; keypoints: its N persons, hidden what was not used; lifted: their 3D, both in the
-    layout of the output; attitudes: (N,4) quaternions of the body axes; given: the keypoints in the model's layout, low
-    confidences hidden; bone_width in the units of the points; camera: its intrinsics, None where they are not known.
+    layout of the output; given: the keypoints in the model's layout, low confidences hidden; bone_width in the units of
+    the points; camera: its intrinsics, None where they are not known; axes: works out the attitudes.
     """
 
     header: object
     keypoints: Keypoints2D
     lifted: Lifted
     layout: Layout
-    attitudes: np.ndarray
     given: Keypoints2D
     bone_width: float
     camera: Intrinsics | None
+    axes: Callable[[], np.ndarray]
+
+    @functools.cached_property
+    def attitudes(self) -> np.ndarray:
+        """(N,4) quaternions of the body axes, worked out only where somebody listens to them."""
+        return self.axes()
 
     def message(self, output: str, make):
         """One output message by name, of OUTPUTS or OPTIONAL; persons that were not lifted are left out."""
@@ -198,6 +204,7 @@ class LiftStream:
         self._image_size: tuple[int, int] | None = None
         self._gathered = _Gathered()
         self._measures, self._steady = left_and_up(lifter.model.layout), Steady()
+        self._bone_width = _BONE_WIDTH * float(np.ptp(lifter.model.mean_shape, axis=1).max())
         self._filter = OneEuro(smoothing)
         self._depths = Depths()
 
@@ -358,23 +365,26 @@ class LiftStream:
         # What is no person has its root anywhere, on its skin for all that is known.
         surface = SURFACE if model.stature else 0.0
         lifted, said = self._depths.place(lifted, given.stamp, self.intrinsics, surface)
-        self.notes += Counter(said)
+        if said:
+            self.notes += Counter(said)
         lifted = self._filter(given.ids, given.stamp, lifted, model.layout.root)
         unit = self.lifter.metres_per_unit if lifted.units == "m" else 1.0
-        width = _BONE_WIDTH * float(np.ptp(model.mean_shape, axis=1).max()) * unit
         visible = np.where(lifted.ok[:, None], lifted.used, given.visible)
         used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))
-        axes = body_rotations(lifted.points, lifted.rotation, self._measures)
         return Frame(
             header,
             route.keypoints_out(used),
             route.lifted_out(lifted),
             route.output,
-            self._steady(given.ids, quaternions(axes)),
             given,
-            width,
+            self._bone_width * unit,
             self.intrinsics,
+            functools.partial(self._attitudes, given.ids, lifted),
         )
+
+    def _attitudes(self, ids: tuple[str, ...], lifted: Lifted) -> np.ndarray:
+        """Quaternions (N,4) of persons in the model's layout; signs are steady over the frames that are asked for."""
+        return self._steady(ids, quaternions(body_rotations(lifted.points, lifted.rotation, self._measures)))
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:
         start = time.perf_counter_ns()
