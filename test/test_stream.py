@@ -13,6 +13,7 @@ from conftest import PERSON, camera_info, header_of, persons_at, seen
 from scipy.spatial.transform import Rotation
 
 from msg_adapters import outputs
+from paul_ros import stream as module
 from paul_ros.lifter import Lifter
 from paul_ros.model import ModelError, load_model
 from paul_ros.parameters import ParameterError
@@ -409,6 +410,16 @@ def test_one_pose_a_person_in_bodies(stream, make):
         np.testing.assert_allclose((p.x, p.y, p.z), where, atol=0.03)
         axes = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix().T
         np.testing.assert_allclose(axes, [(0, 0, -1), (1, 0, 0), (0, -1, 0)], atol=0.06)
+
+
+def test_body_axes_are_worked_out_once_and_only_where_asked_for(stream, make, monkeypatch):
+    asked, quaternions = [], module.quaternions
+    monkeypatch.setattr(module, "quaternions", lambda R: asked.append(len(R)) or quaternions(R))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
+    frame.message("poses", make)
+    assert asked == []
+    np.testing.assert_array_equal(frame.attitudes, frame.attitudes)
+    assert asked == [len(GOOD)]
 
 
 def test_smoothing_is_off_until_it_is_set(stream, make):
