@@ -5,7 +5,7 @@ VENV := .venv
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 SOURCES := setup.py setup.cfg pyproject.toml package.xml \
-	$(shell find paul_ros msg_adapters training lib launch config resource bags -type f -not -path '*/__pycache__/*')
+	$(shell find paul_ros msg_adapters training lib launch config rviz foxglove sros2 resource bags -type f -not -path '*/__pycache__/*')
 
 .PHONY: setup demo test lint clean
 

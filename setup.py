@@ -19,7 +19,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"lib/{NAME}", [f"lib/{NAME}/lifter", f"lib/{NAME}/paul"]),
-        *(shared(folder) for folder in ("launch", "config")),
+        *(shared(folder) for folder in ("launch", "config", "rviz", "foxglove", "sros2")),
         (f"share/{NAME}/bags", ["bags/ACKNOWLEDGEMENT.md", *(f"bags/{name}.mcap" for name in BAGS)]),
     ],
 )

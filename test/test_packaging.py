@@ -164,7 +164,7 @@ print(*sorted(f.name for f in (importlib.resources.files('paul_ros') / 'models')
     assert models.split() == sorted(path.name for path in (ROOT / "paul_ros/models").glob("*.npz"))
     share = install.prefix / "share" / PACKAGE
     assert (share / "package.xml").read_bytes() == (ROOT / "package.xml").read_bytes()
-    for folder in ("launch", "config"):
+    for folder in ("launch", "config", "rviz", "foxglove", "sros2"):
         assert sorted(path.name for path in (share / folder).iterdir()) == sorted(os.listdir(ROOT / folder))
     assert {path.name for path in (share / "bags").iterdir()} >= {"ACKNOWLEDGEMENT.md", "one_person.mcap"}
 
