@@ -137,7 +137,7 @@ class _Points(NamedTuple):
             mean = (X @ w[..., None])[..., 0]
             X -= mean[..., None]
             moments = (X * w[:, None]) @ X.transpose(0, 2, 1)
-            sound &= moments.trace(axis1=1, axis2=2) < _LARGEST**2
+            sound &= np.einsum("nii->n", moments) < _LARGEST**2
         if not sound.all():
             for part in (X, w, mean, moments):
                 part[~sound] = 0.0

@@ -324,9 +324,10 @@ def _frame(xp: Kind, n: Vector) -> Vector:
     """u = e1 + i e2 with e1, e2, n orthonormal and right-handed (Duff et al., JCGT 2017)."""
     x, y, z = n
     sign = xp.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return (1.0 + sign * x * x * a + 1j * b, sign * b + 1j * (sign + y * y * a), -sign * x - 1j * y)
+    over = -1.0 / (sign + z)
+    a, b, c = x * over, y * over, sign * x
+    d = a * y
+    return (1.0 + c * a + 1j * d, sign * d + 1j * (sign + y * b), -1j * y - c)
 
 
 # --- the goal on the sphere, and the way up
@@ -341,9 +342,11 @@ def _view(xp: Kind, problem: Problem, n: Vector, scale: Scale) -> View:
     zc = z.conjugate()
     T = (z * zc).real + _TINY
     T_slope, T_m, T_w = -2 * zc * y, 2 * (y * y.conjugate()).real - T, -zc * (u0 * d0 + u1 * d1 + u2 * d2)
-    an0, an1, an2 = a0 * n0, a1 * n1, a2 * n2
-    E = an0 * n0 + an1 * n1 + an2 * n2
-    E_slope, E_m, E_w = 2 * (an0 * u0 + an1 * u1 + an2 * u2), 1 - 3 * E, a0 * u0 * u0 + a1 * u1 * u1 + a2 * u2 * u2
+    # As n.n = 1 and n.u = u.u = 0, a may be less by a0 all over but for E itself.
+    b1, b2 = a1 - a0, a2 - a0
+    bn1, bn2 = b1 * n1, b2 * n2
+    E = a0 + bn1 * n1 + bn2 * n2
+    E_slope, E_m, E_w = 2 * (bn1 * u1 + bn2 * u2), 1 - 3 * E, b1 * u1 * u1 + b2 * u2 * u2
     if scale == "unit":
         k = problem.k
         f = (1 - k) / xp.sqrt(T)
@@ -444,7 +447,9 @@ def _solve_from(xp: Kind, problem: Problem, one: View, scale: Scale) -> Solution
     """The same with the first climb done."""
     two = xp.climb(problem, _reversal(one.n), scale, one.n)
     swap = (two.g > one.g) & _apart(two.n, one.n)
-    found = _with_rival(xp, problem, xp.where(swap, two, one), xp.where(swap, one, two), scale)
+    if xp.any(swap):
+        one, two = xp.where(swap, two, one), xp.where(swap, one, two)
+    found = _with_rival(xp, problem, one, two, scale)
     return found if xp.every(found.certified) else xp.retry(_search, problem, found, scale, _SEARCH_CLIMBS)
 
 
