@@ -7,6 +7,7 @@ when a bag is opened. A damaged bag gives what can still be read, then a BagErro
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import tempfile
@@ -40,6 +41,10 @@ class BagError(Exception):
     def __init__(self, text: str, messages_read: int = 0):
         super().__init__(text)
         self.messages_read = messages_read
+
+
+class WriteError(BagError):
+    """A bag that cannot be written, or not to its end."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,8 @@ class BagWriter:
     The bytes go to `PATH.part`, chunk by chunk, and take the name PATH in one step when the block ends well. A block
     that fails leaves PATH as it was and nothing else; a writer that is killed leaves the `.part` file too, which
     `read_messages` (or `mcap recover`) reads up to the last whole chunk. Equal input gives equal bytes.
-    compression: 'zstd', 'lz4' or 'none'. Entering raises BagError where the file cannot be written.
+    compression: 'zstd', 'lz4' or 'none'. Raises BagError where the file cannot be written at
+    all, WriteError where that shows on the way.
     """
 
     def __init__(self, path: str | Path, messages: BagMessages | None = None, compression: str = "zstd"):
@@ -164,7 +170,8 @@ class BagWriter:
             enable_data_crcs=True,
             compression=CompressionType[self._compression.upper()],
         )
-        self._writer.start(profile="ros2", library="paul_ros")
+        with self._told():
+            self._writer.start(profile="ros2", library="paul_ros")
         return self
 
     def write(self, topic: str, message: Any, log_time: int, qos: str = "") -> None:
@@ -179,8 +186,9 @@ class BagWriter:
     def write_record(self, record: Record) -> None:
         """Append a record of another bag as it is, with its definition."""
         channel = self._channels.get(record.topic) or self._add_channel(record)
-        # rosbag2 and rosbags set publish_time = log_time too where the middleware gave none.
-        self._writer.add_message(channel, record.log_time, record.data, record.log_time)
+        with self._told():
+            # rosbag2 and rosbags set publish_time = log_time too where the middleware gave none.
+            self._writer.add_message(channel, record.log_time, record.data, record.log_time)
         self.count += 1
 
     def _add_channel(self, record: Record) -> int:
@@ -196,13 +204,23 @@ class BagWriter:
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         try:
             if kind is None:
-                self._writer.finish()
-                self._file.flush()
-                os.fsync(self._file.fileno())
-                os.replace(self.part, self.path)
+                with self._told():
+                    self._writer.finish()
+                    self._file.flush()
+                    os.fsync(self._file.fileno())
+                    os.replace(self.part, self.path)
         finally:
-            self.part.unlink(missing_ok=True)  # before closing, which on a full disk fails as the writing did
-            self._file.close()
+            self.part.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # on a full disk closing fails as the writing did
+                self._file.close()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """What the disk refuses, as an error that names the file."""
+        try:
+            yield
+        except OSError as error:
+            raise WriteError(f"cannot write {self.path}: {error.strerror}") from error
 
 
 def check_output(path: Path) -> None:

@@ -26,6 +26,7 @@ from paul_ros.bag import (
     BagMessages,
     BagWriter,
     Record,
+    WriteError,
     check_outputs,
     matches,
     read_records,
@@ -140,9 +141,11 @@ def replay(
                 if shell.take(record):
                     on_frame()
             shell.finish()
+        except (WrongTopic, WriteError):
+            raise
         except BagError as error:
             shell.finish()
-            if not done.frames or isinstance(error, WrongTopic):
+            if not done.frames:
                 raise
             done.damage = error
         if not shell.keypoint_messages:

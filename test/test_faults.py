@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What goes wrong around the node and while recording: publishers that die, floods, full disks, kills."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+from mcap.exceptions import McapError
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from node_bench import PATIENCE, Bench
+
+from paul_ros.bag import BagError, read_messages, topics_of
+
+ONE = ROOT / "bags/one_person.mcap"
+#: Publishes a good cloud at RATE Hz, its stamps from FIRST on, COUNT times once the node has answered one.
+PUBLISHER = """
+import os, sys, time
+domain = os.environ["ROS_DOMAIN_ID"]
+from conftest import RosMake, header_of  # which chooses another
+from node_bench import class_of, good
+os.environ["ROS_DOMAIN_ID"] = domain
+import rclpy
+from geometry_msgs.msg import PoseArray
+
+namespace, rate, first, count = sys.argv[1], float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
+rclpy.init()
+node = rclpy.create_node("publisher", namespace=namespace)
+publisher = node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "keypoints", 10)
+answers = []
+node.create_subscription(PoseArray, "lifter/poses", answers.append, 10)
+message, sent = good()(header_of(RosMake())), 0
+
+def publish():
+    global sent
+    message.header.stamp.sec = first + sent
+    publisher.publish(message)
+    sent += 1
+
+while not any(first <= answer.header.stamp.sec < first + 1000 for answer in answers):
+    publish()
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(sent, flush=True)
+due = time.monotonic()
+for _ in range(count):
+    publish()
+    due += 1 / rate
+    time.sleep(max(due - time.monotonic(), 0))
+# What was lost shows when the next comes.
+for _ in range(5):
+    time.sleep(0.1)
+    publish()
+print(sent, flush=True)
+rclpy.spin(node)
+"""
+
+
+class Publisher:
+    """A publisher as a process of its own; stamps in seconds from `first` on."""
+
+    def __init__(self, namespace: str, rate: float, first: int, count: int) -> None:
+        env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+        env["PYTHONPATH"] = os.pathsep.join((str(ROOT), str(ROOT / "test"), env.get("PYTHONPATH", "")))
+        # A process that is killed leaves its shared memory behind.
+        env["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
+        arguments = [namespace, *map(str, (rate, first, count))]
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", PUBLISHER, *arguments], cwd=ROOT, env=env, stdout=subprocess.PIPE, text=True
+        )
+
+    def said(self) -> int:
+        """The next number that it prints."""
+        return int(self.process.stdout.readline())
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait(PATIENCE)
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def start_publisher():
+    started: list[Publisher] = []
+
+    def start(*arguments) -> Publisher:
+        started.append(Publisher(*arguments))
+        return started[-1]
+
+    yield start
+    for publisher in started:
+        if publisher.process.poll() is None:
+            publisher.kill()
+
+
+def heard(bench: Bench, first: int) -> list[int]:
+    """Stamps of the poses from one publisher."""
+    seconds = (message.header.stamp.sec for message in bench.got["poses"])
+    return [second for second in seconds if first <= second < first + 1_000_000]
+
+
+@pytest.fixture
+def bench(ros, start_lifter, model_file):
+    bench = Bench(ros, start_lifter("-p", f"model:={model_file}"))
+    bench.until(bench.keypoints.get_subscription_count, "a subscription")
+    yield bench
+    bench.close()
+
+
+def settled(bench: Bench) -> dict:
+    """Diagnostics once no more frames come."""
+    before = None
+    while (now := bench.diagnosed())["frames"] != before:
+        before = now["frames"]
+    return now
+
+
+def test_a_publisher_that_is_killed_and_another_that_comes(bench, start_publisher):
+    dies = start_publisher(bench.lifter.namespace, 100, 1_000_000, 10**6)
+    bench.until(lambda: len(heard(bench, 1_000_000)) > 20, "answers to the first")
+    dies.kill()
+    start_publisher(bench.lifter.namespace, 100, 2_000_000, 10**6)
+    bench.until(lambda: len(heard(bench, 2_000_000)) > 20, "answers to the second")
+    found = bench.diagnosed()
+    assert "dropped_internal_error" not in found
+    # The second's numbers start again at one: that is no loss.
+    assert int(found.get("dropped_missed", 0)) < int(found["frames"])
+    bench.lifts()
+
+
+def test_two_publishers_at_once_are_both_lifted(bench, start_publisher):
+    """A mistake of the user's, as where a detector was started twice: nothing breaks and no loss is made up."""
+    firsts = (1_000_000, 2_000_000)
+    for first in firsts:
+        start_publisher(bench.lifter.namespace, 50, first, 10**6)
+    for first in firsts:
+        bench.until(lambda: len(heard(bench, first)) > 50, f"answers to {first}")
+    found = bench.diagnosed()
+    assert {key for key in found if key.startswith("dropped_")} <= {"dropped_missed"}
+    assert int(found["noted_stamp_backwards"]) > 10
+    bench.lifts()
+
+
+def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_publisher):
+    """1000 Hz are more than one core may manage, and this process takes a message every 20 ms."""
+    bench.node.destroy_publisher(bench.keypoints)
+    flood = start_publisher(bench.lifter.namespace, 1000, 1_000_000, 3000)
+    warm = flood.said()
+    while flood.process.poll() is None and len(heard(bench, 1_003_000)) < 2:
+        time.sleep(0.02)
+        bench.ros.spin_once(bench.node, timeout_sec=0)
+    sent = flood.said()
+    found = settled(bench)
+    frames, missed = int(found["frames"]), int(found.get("dropped_missed", 0))
+    assert sent - warm < frames + missed <= sent, found
+    assert frames > 300 and "dropped_internal_error" not in found
+
+
+# --- recording
+
+REPLAY = [sys.executable, "-m", "paul_ros.cli", "replay", str(ONE), "-o"]
+
+
+def recorded(path: Path) -> int:
+    """Messages that come out of a file that may end anywhere."""
+    count = 0
+    try:
+        for _ in read_messages(path):
+            count += 1
+    except BagError as error:
+        assert error.messages_read == count
+    return count
+
+
+def recovered(path: Path) -> int:
+    """The same by mcap's own reader of streams, which is what tools for recovery are made of."""
+    count = 0
+    with open(path, "rb") as stream:
+        try:
+            for record in StreamReader(stream).records:
+                count += isinstance(record, Message)
+        except (McapError, EOFError):
+            pass
+    return count
+
+
+def test_a_full_disk_while_recording_is_one_line(tmp_path):
+    """The limit of a file's size stands for the disk's."""
+    out = tmp_path / "lifted.mcap"
+    code = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000)); "
+        "sys.argv = sys.argv[1:]; from paul_ros.cli import main; sys.exit(main())"
+    )
+    answer = subprocess.run(
+        [sys.executable, "-c", code, "paul", "replay", str(ONE), "-o", str(out)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert answer.returncode == 1
+    [line] = [line for line in answer.stderr.splitlines() if line and "replay" not in line.split(":")[0]]
+    assert "too large" in line and str(out) in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_recording_that_is_killed_is_readable(tmp_path, kind):
+    out = tmp_path / "lifted.mcap"
+    part = out.with_name("lifted.mcap.part")
+    process = subprocess.Popen(
+        [*REPLAY, str(out)], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    end = time.monotonic() + PATIENCE
+    while not (part.exists() and part.stat().st_size > 300_000):
+        assert process.poll() is None and time.monotonic() < end
+        time.sleep(0.001)
+    process.send_signal(kind)
+    _, said = process.communicate(timeout=PATIENCE)
+    assert process.returncode != 0 and not out.exists() and "Traceback" not in said
+    if kind == signal.SIGINT:
+        assert not part.exists()
+        return
+    whole = sum(count for _, count in topics_of(ONE).values())
+    assert 100 < recorded(part) < 5 * whole
+    assert recovered(part) == recorded(part)
+    assert "/lifter/poses" in {topic for topic, *_ in lenient(part)}
+
+
+def lenient(path: Path):
+    try:
+        yield from read_messages(path)
+    except BagError:
+        return
