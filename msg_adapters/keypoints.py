@@ -148,6 +148,12 @@ def _common(own: tuple[str, ...], names: tuple[str, ...]) -> tuple[np.ndarray, n
     return tuple(np.array(pairs).T)
 
 
+def as_float64(values: np.ndarray) -> np.ndarray:
+    """A copy; of signalling NaN, which damaged bytes may be, without numpy's warning."""
+    with np.errstate(invalid="ignore"):
+        return np.array(values, dtype=np.float64)
+
+
 def record(
     xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header, present: np.ndarray | None = None
 ) -> Keypoints2D:
@@ -158,7 +164,7 @@ def record(
     says so, where x or y is not finite or beyond ABSURD_PIXELS, or where its confidence is not finite.
     Confidences are clipped to 0..1: some detectors' peaks reach a little above one.
     """
-    xy = np.array(xy, dtype=np.float64)
+    xy = as_float64(xy)
     with np.errstate(invalid="ignore"):
         visible = (np.abs(xy) <= ABSURD_PIXELS).all(axis=-1)
     if present is not None:
@@ -166,7 +172,7 @@ def record(
     if confidence is None:
         confidence = np.ones(visible.shape)
     else:
-        confidence = np.asarray(confidence, dtype=np.float64)
+        confidence = as_float64(confidence)
         visible &= np.isfinite(confidence)
     xy[~visible] = np.nan
     confidence = np.where(visible, np.clip(confidence, 0.0, 1.0), 0.0)

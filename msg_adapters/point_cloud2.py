@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, MessageError, Source, WrongPointCount, record, split_persons
+from msg_adapters.keypoints import Keypoints2D, MessageError, Source, WrongPointCount, as_float64, record, split_persons
 
 #: sensor_msgs/PointField datatype -> numpy type without byte order.
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -116,7 +116,7 @@ def _persons_first(cloud: np.ndarray, points: int) -> np.ndarray:
 
 def _ids(column: np.ndarray) -> tuple[str, ...]:
     """One id a person from the (N, P) person_id field: the first number that is no NaN and not negative."""
-    column = column.astype(np.float64)
+    column = as_float64(column)
     known = np.isfinite(column) & (column >= 0)
     first = np.take_along_axis(column, known.argmax(axis=1)[:, None], axis=1)[:, 0]
     return tuple(f"{value:.0f}" if is_known else "" for value, is_known in zip(first, known.any(axis=1)))

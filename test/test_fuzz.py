@@ -7,6 +7,7 @@ import importlib.util
 import io
 import json
 import logging
+import random
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -122,6 +123,18 @@ def test_a_model_that_zip_cannot_unpack_is_refused(bench, tmp_path, place, value
     path.write_bytes(fuzz.sealed(bytes(data)))
     with pytest.raises(ModelError, match="is no model file"):
         load_model(path)
+
+
+@pytest.mark.filterwarnings("error")
+def test_signalling_nan_is_missing_without_a_warning(bench):
+    """A fault that was found: numpy's own words in the robot's log."""
+    make, rng = bench.live, random.Random(0)
+    message = fuzz.cloud(make, fuzz.header(make, rng, 1), [fuzz.pose(rng)], rng)
+    data = np.array(message.data, np.uint8).reshape(17, -1)
+    data[3] = np.tile(np.frombuffer(np.uint32(0x7F800001).tobytes(), np.uint8), data.shape[1] // 4)
+    message.data = make.octets(data.tobytes())
+    found = msg_adapters.read(fuzz.foreign.CLOUD, message, 17)
+    assert not found.visible[0, 3] and found.visible.sum() == 16
 
 
 def test_the_command(tmp_path, capsys, monkeypatch):
