@@ -8,9 +8,9 @@ of two layouts that are only nearly the same place on the body have different na
 from __future__ import annotations
 
 import difflib
+import functools
 import re
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from importlib import resources
 from pathlib import Path
 
@@ -64,14 +64,14 @@ class Part:
     points: tuple[int, ...]
     edges: tuple[tuple[int, int], ...]
 
-    @cached_property
+    @functools.cached_property
     def columns(self) -> slice | list[int]:
         """The points as an index of arrays; those that lie side by side as a slice, which copies nothing."""
         first, last = self.points[0], self.points[-1]
         together = self.points == tuple(range(first, last + 1))
         return slice(first, last + 1) if together else list(self.points)
 
-    @cached_property
+    @functools.cached_property
     def ends(self) -> np.ndarray:
         """(2,E) indices of the edges' ends."""
         return np.array(self.edges, int).reshape(-1, 2).T
@@ -128,7 +128,7 @@ class Layout:
             layout["min_visible"] = self.min_visible
         return layout
 
-    @cached_property
+    @functools.cached_property
     def mirror(self) -> np.ndarray:
         """(P,) indices: points[mirror] has left and right swapped."""
         order = np.arange(len(self.names))
@@ -136,14 +136,14 @@ class Layout:
             order[[left, right]] = right, left
         return order
 
-    @cached_property
+    @functools.cached_property
     def mirrored_edges(self) -> np.ndarray:
         """(E,) indices: for each edge the one on the other side, or itself where there is none."""
         place = {frozenset(edge): index for index, edge in enumerate(self.edges)}
         twins = (frozenset(self.mirror[list(edge)].tolist()) for edge in self.edges)
         return np.array([place.get(twin, index) for index, twin in enumerate(twins)], int)
 
-    @cached_property
+    @functools.cached_property
     def parts(self) -> tuple[Part, ...]:
         """The categories; one part of all points where there are none."""
         if not self.categories:
@@ -217,7 +217,7 @@ class Mapping:
             mapped[:, points] = array[:, parts].sum(1) / len(parts)
         return mapped
 
-    @cached_property
+    @functools.cached_property
     def _groups(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Target points (G,) that are means of k source points each, and these (k,G), for every such k."""
         counts = np.array([len(parts) for parts in self.sources])
@@ -257,7 +257,7 @@ def load_layout(name_or_path: str | Path) -> Layout:
     """
     name = str(name_or_path)
     if name in layout_names():
-        return Layout.from_dict(yaml.safe_load((_SHIPPED / f"{name}.yaml").read_bytes()))
+        return _shipped(name)
     if anonymous := re.fullmatch(r"points(\d{1,6})", name):
         return anonymous_layout(int(anonymous[1]))
     path = Path(name_or_path)
@@ -267,6 +267,13 @@ def load_layout(name_or_path: str | Path) -> Layout:
         return Layout.from_dict(_read_yaml(path))
     except LayoutError as error:
         raise LayoutError(f"layout file {path}: {error}") from None
+
+
+@functools.cache
+def _shipped(name: str) -> Layout:
+    # With libyaml in a tenth of the time. Not for users' files: it recurses in C, where too deep a nesting is no error.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    return Layout.from_dict(yaml.load((_SHIPPED / f"{name}.yaml").read_bytes(), loader))
 
 
 def _unknown(name: str) -> str:
