@@ -113,7 +113,9 @@ def test_points_beyond_the_horizon_do_not_count_as_seen(model):
     xy = np.random.default_rng(0).normal(360, 50, (1, 17, 2))
     xy[0, :5, 0] = 1e6
     xy[0, 5:, 0] = -1e6
-    assert np.isfinite(centred_view(xy, visible, CAMERA).W).all(1).sum() < model.min_visible
+    view = centred_view(xy, visible, CAMERA)
+    np.testing.assert_array_equal(np.isfinite(view.W).all(1), view.seen)
+    assert view.seen.sum() < model.min_visible
     assert Lifter(model).lift(xy, visible, CAMERA).reason == (TOO_FEW_POINTS,)
 
 
@@ -192,6 +194,8 @@ def test_the_virtual_camera_looks_at_the_person():
     view = centred_view(pinhole(truth), everything(truth), CAMERA)
     assert np.abs(view.W.mean(2)).max() < 0.02
     np.testing.assert_allclose(np.linalg.det(view.turn), 1)
+    vectors = Rotation.from_matrix(view.turn).as_rotvec()
+    np.testing.assert_allclose(vectors[:, 2], 0, atol=1e-12)  # the smallest rotation does not roll
     seen = np.einsum("nji,npj->nip", view.turn, truth)
     np.testing.assert_allclose(view.W, seen[:, :2] / seen[:, 2:], atol=1e-9)
 

@@ -247,6 +247,10 @@ def test_unknown_models_are_named_with_the_known_ones():
         load_model("/nowhere/x.npz")
 
 
+def test_weights_lie_as_a_few_persons_are_multiplied_fastest(saved):
+    assert all(weight.T.flags.c_contiguous for weight in load_model(saved).weights.values())
+
+
 def test_shape_ignores_place_size_and_hidden_points(saved):
     model = load_model(saved)
     rng = np.random.default_rng(1)
