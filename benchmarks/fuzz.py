@@ -14,8 +14,8 @@ A case is one message, one serialised message, one bag or one model file, made w
 - models: the file, or what is in it with a checksum that is right.
 
 A crash is an exception that the documentation of what was called does not promise, a warning of numpy's, or a number
-of an output that is not finite. A frame is lost uncounted where a message that was handed in has neither become a frame (or
-part of one) nor a drop. Sessions of a few cases share a stream; `--only KIND --session NUMBER` makes one again.
+of an output that is not finite. A frame is lost uncounted where a message that was handed in has neither become a frame
+(or part of one) nor a drop. Sessions of a few cases share a stream; `--only KIND --session NUMBER` makes one again.
 """
 
 from __future__ import annotations

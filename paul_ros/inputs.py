@@ -11,6 +11,7 @@ from rclpy.subscription import Subscription
 import msg_adapters
 from paul_ros.health import Aloud
 from paul_ros.ros import NOT_POSSIBLE, OVERRIDES, input_qos, message_class, unheard
+from paul_ros.sequence import PublicationNumbers
 from paul_ros.tracked import BODY, LIST, Tracked
 
 
@@ -49,7 +50,6 @@ class KeypointInput:
         self.topic = node.resolve_topic_name(topic)
         self._subscription: Subscription | None = None
         self._bodies: Tracked | None = None
-        self._numbers: dict[str, int] = {}
 
     def look(self) -> bool:
         """Subscribes if that is possible now; says what is missing where it is not. Whether it is subscribed."""
@@ -116,15 +116,10 @@ class KeypointInput:
         return self._node.create_subscription(message_class(BODY), topic, self._reader(BODY, topic), input_qos())
 
     def _reader(self, type_name: str, topic: str) -> Callable:
-        self._numbers[topic] = 0
+        numbers = PublicationNumbers()
 
         def on_message(msg, info: dict) -> None:
-            self._take(type_name, msg, topic, self._missed(topic, info["publication_sequence_number"]))
+            number = info["publication_sequence_number"]
+            self._take(type_name, msg, topic, numbers.missed(number, lambda: self._node.count_publishers(topic)))
 
         return on_message
-
-    def _missed(self, topic: str, number: int) -> int:
-        """How many numbers were left out; of several publishers they cannot be told apart, then none is counted."""
-        last, self._numbers[topic] = self._numbers[topic], number
-        missed = number - last - 1 if last else 0
-        return missed if missed > 0 and self._node.count_publishers(topic) == 1 else 0

@@ -147,9 +147,11 @@ def test_two_publishers_at_once_are_both_lifted(bench, start_publisher):
     bench.lifts()
 
 
-def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_publisher):
+@pytest.mark.parametrize("silent", [0, 1], ids=["alone", "beside one that is silent"])
+def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_publisher, silent):
     """1000 Hz are more than one core may manage, and this process takes a message every 20 ms."""
-    bench.node.destroy_publisher(bench.keypoints)
+    if not silent:
+        bench.node.destroy_publisher(bench.keypoints)
     flood = start_publisher(bench.lifter.namespace, 1000, 1_000_000, 3000)
     warm = flood.said()
     while flood.process.poll() is None and len(heard(bench, 1_003_000)) < 2:
@@ -158,7 +160,8 @@ def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_pub
     sent = flood.said()
     found = settled(bench)
     frames, missed = int(found["frames"]), int(found.get("dropped_missed", 0))
-    assert sent - warm < frames + missed <= sent, found
+    # One gap is taken for the first number of the other publisher; it is less than what waits in between.
+    assert sent - warm - 50 * silent < frames + missed <= sent, found
     assert frames > 300 and "dropped_internal_error" not in found
 
 
