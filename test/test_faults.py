@@ -193,24 +193,30 @@ def recovered(path: Path) -> int:
     return count
 
 
+def on_a_full_disk(code: str, *arguments: object) -> subprocess.CompletedProcess:
+    """Python code in a process that may write no file larger than 300 kB: that limit stands for the disk's."""
+    limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n" + code
+    command = [sys.executable, "-c", limited, *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+
+
 def test_a_full_disk_while_recording_is_one_line(tmp_path):
-    """The limit of a file's size stands for the disk's."""
     out = tmp_path / "lifted.mcap"
-    code = (
-        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000)); "
-        "sys.argv = sys.argv[1:]; from paul_ros.cli import main; sys.exit(main())"
-    )
-    answer = subprocess.run(
-        [sys.executable, "-c", code, "paul", "replay", str(ONE), "-o", str(out)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-    )
+    code = "import sys; from paul_ros.cli import main; sys.exit(main())"
+    answer = on_a_full_disk(code, "replay", ONE, "-o", out)
     assert answer.returncode == 1
-    [line] = [line for line in answer.stderr.splitlines() if line and "replay" not in line.split(":")[0]]
-    assert "too large" in line and str(out) in line
+    [line] = [line for line in answer.stderr.splitlines() if line.startswith("paul: ")]
+    assert line == f"paul: cannot write {out}: File too large" and "Traceback" not in answer.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_the_old_file_and_names_it(tmp_path):
+    out = tmp_path / "report.json"
+    out.write_bytes(b"precious")
+    code = "import sys; from paul_ros.files import write_atomically; write_atomically(sys.argv[1], bytes(10**6))"
+    answer = on_a_full_disk(code, out)
+    assert answer.returncode == 1 and f"File too large: '{out}'" in answer.stderr.splitlines()[-1]
+    assert out.read_bytes() == b"precious" and list(tmp_path.iterdir()) == [out]
 
 
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
