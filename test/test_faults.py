@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -11,11 +12,12 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, camera_info, header_of
 from mcap.exceptions import McapError
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
-from node_bench import PATIENCE, Bench
+from node_bench import MAKE, PATIENCE, Bench, good
+from test_node import half_way
 
 from paul_ros.bag import BagError, read_messages, topics_of
 
@@ -163,6 +165,27 @@ def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_pub
     # One gap is taken for the first number of the other publisher; it is less than what waits in between.
     assert sent - warm - 50 * silent < frames + missed <= sent, found
     assert frames > 300 and "dropped_internal_error" not in found
+
+
+@pytest.mark.parametrize("topic", ["keypoints", "camera", "depth"])
+def test_bytes_that_are_no_message_do_not_stop_the_node(bench, topic):
+    """As of a publisher whose definition of the type is another."""
+    from rclpy.serialization import serialize_message
+
+    publisher = getattr(bench, topic)
+    bench.matched()
+    whole = {
+        "keypoints": good()(header_of(MAKE)),
+        "camera": camera_info(MAKE),
+        "depth": half_way(1),
+    }[topic]
+    data, rng = serialize_message(whole), random.Random(1)
+    for number in range(30):
+        cut = data[: 4 + rng.randrange(len(data) - 4)] if number % 2 else data[:4] + rng.randbytes(60)
+        publisher.publish(cut)
+        bench.ros.spin_once(bench.node, timeout_sec=0.01)
+    bench.lifts()
+    assert "Traceback" not in bench.lifter.log()
 
 
 # --- recording
