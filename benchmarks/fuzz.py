@@ -12,6 +12,7 @@ A case is one message, one serialised message, one bag or one model file, made w
 - cdr: PointCloud2 as bytes, for the reader of serialised messages; what it reads, rosbags must read alike.
 - bags: bits flipped, bytes cut off, put in and exchanged, and sound bags of unsound messages; read and replayed.
 - models: the file, or what is in it with a checksum that is right.
+- layouts: the YAML as text, or the values in it.
 
 A crash is an exception that the documentation of what was called does not promise, a warning of numpy's, or a number
 of an output that is not finite. A frame is lost uncounted where a message that was handed in has neither become a frame
@@ -46,6 +47,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
 import foreign_messages as foreign
 import numpy as np
+import yaml
 
 import msg_adapters
 from msg_adapters import outputs
@@ -53,7 +55,7 @@ from msg_adapters.cdr import CloudReader
 from paul_ros.bag import BagError, BagMessages, BagWriter, read_records
 from paul_ros.files import write_atomically
 from paul_ros.lifter import Lifter
-from paul_ros.model import ModelError, load_model
+from paul_ros.model import ModelError, load_model, weight_shapes
 from paul_ros.replay import Topics, evaluate, replay
 from paul_ros.skeleton import LayoutError, load_layout
 from paul_ros.stream import LiftStream
@@ -62,7 +64,7 @@ SESSION = 25  # cases
 BODIES = "/humans/bodies/{}/skeleton2d"
 COCO = load_layout("coco17").names
 #: Share of the cases of each kind.
-KINDS = {"fields": 0.40, "junk": 0.15, "cdr": 0.35, "bags": 0.05, "models": 0.05}
+KINDS = {"fields": 0.40, "junk": 0.15, "cdr": 0.32, "bags": 0.05, "models": 0.05, "layouts": 0.03}
 #: Sequences whose length the message's definition fixes, by (name of the field, length).
 FIXED = {("skeleton", 18), ("keypoints", 70), ("kp", 2), ("k", 9), ("r", 9), ("p", 12)}
 FLOATS = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, -1.0, 0.5, 1e-320, 1e-9, 1e6, 1.0001e6, -1e30, 1e38, 1.7e308)
@@ -353,9 +355,6 @@ class Bench:
 
 def tiny_model(folder: Path) -> tuple[dict, dict]:
     """Header and arrays of a small model, to be broken."""
-    from paul_ros.model import weight_shapes
-    from paul_ros.skeleton import load_layout
-
     layout = load_layout("coco17")
     sizes = {"encoder": {"kind": "residual", "width": 4, "blocks": 1}, "decoder": {"kind": "mlp", "hidden": [4]}}
     plain = {"format": 1, "layout": layout.to_dict(), "bottleneck": 2, "metres_per_unit": 0.3, "stature": 1.7}
@@ -630,6 +629,28 @@ def sealed(data: bytes) -> bytes:
     return data + hashlib.sha256(data).hexdigest().encode()
 
 
+def layout_session(bench, rng, tally, cases, where):
+    path, whole = bench.folder / "broken.yaml", load_layout("coco17").to_dict()
+    text = yaml.safe_dump(whole).encode()
+    for _ in range(cases):
+        tally.cases += 1
+        start = time.perf_counter()
+        path.write_bytes(break_bytes(text, rng) if rng.random() < 0.5 else broken_layout(whole, rng))
+        try:
+            load_layout(path)
+            tally.accepted += 1
+        except LayoutError as error:
+            tally.refused += 1
+            one_line(error, tally, where)
+        except Exception:
+            tally.crash(where)
+        tally.slowest_ms = max(tally.slowest_ms, 1000 * (time.perf_counter() - start))
+
+
+def broken_layout(whole: dict, rng: random.Random) -> bytes:
+    return yaml.safe_dump(broken_json(whole, rng)).encode() if rng.random() < 0.9 else yaml.safe_dump(whole).encode()
+
+
 def broken_array(values: np.ndarray, rng: random.Random):
     flat = values.copy()
     flat.flat[rng.randrange(flat.size)] = np.float32(rng.choice(FLOATS[:-1]))
@@ -675,6 +696,7 @@ SESSIONS = {
     "cdr": cdr_session,
     "bags": bag_session,
     "models": model_session,
+    "layouts": layout_session,
 }
 
 

@@ -28,7 +28,7 @@ SCRIPT = Path(__file__).resolve().parent.parent / "benchmarks/fuzz.py"
 _spec = importlib.util.spec_from_file_location("fuzz", SCRIPT)
 fuzz = sys.modules["fuzz"] = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(fuzz)
-CASES = {"fields": 200, "junk": 100, "cdr": 200, "bags": 25, "models": 50}
+CASES = {"fields": 200, "junk": 100, "cdr": 200, "bags": 25, "models": 50, "layouts": 50}
 
 
 @pytest.fixture(scope="module")
