@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+#: Of the cloud of 3D keypoints.
+POINT_FIELDS = ("x", "y", "z", "confidence", "keypoint", "person_id", "ambiguity", "distance_sigma")
 _FLOAT32 = 7
 _SPHERE_LIST, _LINE_LIST = 7, 5
 _ANNOTATED_POINTS, _ANNOTATED_LINES = 1, 4
@@ -57,20 +59,25 @@ def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids, 
     """3D keypoints as an organised cloud, persons x P: x, y, z, confidence, keypoint (index); equal for all points of a
     person: person_id, ambiguity, distance_sigma.
 
+    See point_values.
+    """
+    values = point_values(points, confidence, ids, ambiguity, distance_sigma)
+    return _cloud(make, header, POINT_FIELDS, list(np.moveaxis(values, -1, 0)))
+
+
+def point_values(points: np.ndarray, confidence: np.ndarray, ids, ambiguity, distance_sigma) -> np.ndarray:
+    """(N, P, 8) float32 in the order of POINT_FIELDS.
+
     points (N, P, 3) in the camera's optical frame; confidence (N, P), 0 where the keypoint was not seen; ambiguity (N,)
     0..1; distance_sigma (N,) metres, NaN where there are none.
     """
-    persons, count = confidence.shape
-    keypoint = np.broadcast_to(np.arange(count), (persons, count))
-    each = [
-        np.broadcast_to(column[:, None], (persons, count)) for column in (id_numbers(ids), ambiguity, distance_sigma)
-    ]
-    return _cloud(
-        make,
-        header,
-        ("x", "y", "z", "confidence", "keypoint", "person_id", "ambiguity", "distance_sigma"),
-        [points[..., 0], points[..., 1], points[..., 2], confidence, keypoint, *each],
-    )
+    values = np.empty((*confidence.shape, len(POINT_FIELDS)), "<f4")
+    values[..., :3] = points
+    values[..., 3] = confidence
+    values[..., 4] = np.arange(confidence.shape[1])
+    for column, each in enumerate((id_numbers(ids), ambiguity, distance_sigma), 5):
+        values[..., column] = np.asarray(each)[:, None]
+    return values
 
 
 def skeleton_markers(make, header, points: np.ndarray, observed: np.ndarray, edges, sides, thickness: float):

@@ -14,6 +14,9 @@ from paul_ros.ros import NOT_POSSIBLE, OVERRIDES, input_qos, message_class, unhe
 from paul_ros.sequence import PublicationNumbers
 from paul_ros.tracked import BODY, LIST, Tracked
 
+_RAW = "sensor_msgs/msg/PointCloud2"
+"""The type whose serialised bytes the stream reads; rclpy's objects would cost more than lifting."""
+
 
 def readable() -> list[str]:
     """Names of the types that `keypoints` may have."""
@@ -38,8 +41,9 @@ class KeypointInput:
     ) -> None:
         """wanted: a type's name, or auto; most(): bodies to follow; mismatch(topic, text): QoS that do not match.
 
-        take(type_name, msg, topic, missed) gets each message, and how many before it were published but never came, or
-        were replaced by newer ones while the node was busy. Raises ValueError where the wanted type cannot be read.
+        take(type_name, msg, topic, missed) gets each message, a PointCloud2 as serialised bytes, and how many before it
+        were published but never came, or were replaced by newer ones while the node was busy. Raises ValueError where
+        the wanted type cannot be read.
         """
         if wanted != "auto" and wanted not in readable():
             raise ValueError(f"input_type is {wanted}; it must be auto or one of {', '.join(readable())}")
@@ -109,8 +113,8 @@ class KeypointInput:
         if type_name == LIST:
             self._bodies = Tracked(self.topic, self._open_body, self._node.destroy_subscription)
             return self._node.create_subscription(kind, self.topic, self._follow, input_qos(), **options)
-        on_message = self._reader(type_name, self.topic)
-        return self._node.create_subscription(kind, self.topic, on_message, input_qos(), **options)
+        on_message, raw = self._reader(type_name, self.topic), type_name == _RAW
+        return self._node.create_subscription(kind, self.topic, on_message, input_qos(), raw=raw, **options)
 
     def _open_body(self, topic: str) -> Subscription:
         return self._node.create_subscription(message_class(BODY), topic, self._reader(BODY, topic), input_qos())

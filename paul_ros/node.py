@@ -22,6 +22,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from dataclasses import replace
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -53,7 +54,7 @@ from paul_ros.ros import (
     unhearing,
 )
 from paul_ros.skeleton import LayoutError
-from paul_ros.stream import OPTIONAL, OUTPUTS, Frame, LiftStream, open_stream
+from paul_ros.stream import OPTIONAL, OUTPUTS, PACKED, Frame, LiftStream, open_stream
 
 _LOOK_SECONDS = 0.05
 _REPORT_SECONDS = 1.0
@@ -98,6 +99,7 @@ class LifterNode(LifecycleNode):
         """Raises what parameters are refused with, where one has a value that no parameter of its kind may have."""
         super().__init__("lifter")
         self._make = RosMake()
+        self._writers = {name: make() for name, make in PACKED.items()}
         self._warn = Aloud(self.get_logger().warning)
         # Not ROS time: a simulation that stands still would hold the last image back, and diagnostics too.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -377,13 +379,13 @@ class LifterNode(LifecycleNode):
 
     def _publish(self, frame: Frame) -> None:
         """Builds what somebody listens to and then publishes it, so that a fault leaves no half frame."""
-        built = [
-            (publisher, frame.message(name, self._make))
-            for name, publisher in self._outputs.items()
-            if publisher.get_subscription_count()
-        ]
-        for publisher, message in built:
-            publisher.publish(message)
+        heard = [name for name, publisher in self._outputs.items() if publisher.get_subscription_count()]
+        built = {name: frame.serialised(name, self._writers[name]) for name in heard if name in PACKED}
+        if len(built) < len(heard):
+            frame = replace(frame, header=self._make.header(frame.header))
+            built |= {name: frame.message(name, self._make) for name in heard if name not in PACKED}
+        for name, message in built.items():
+            self._outputs[name].publish(message)
 
     def _now(self) -> int:
         """ns by the clock that stamps are of; rclpy's own call takes ten times as long where it is the system's."""
@@ -522,8 +524,10 @@ def main() -> int:
 def _spin(node: LifterNode, stop: threading.Event) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    # Not spin_once's own timeout: that makes and destroys a timer each time.
+    node.create_timer(_STOP_SECONDS, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
     while rclpy.ok() and not stop.is_set():
-        executor.spin_once(timeout_sec=_STOP_SECONDS)
+        executor.spin_once()
 
 
 if __name__ == "__main__":

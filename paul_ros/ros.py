@@ -49,6 +49,11 @@ class RosMake:
     def __call__(self, type_name: str, **fields):
         return message_class(type_name)(**fields)
 
+    def header(self, header):
+        """std_msgs/Header, whatever reader the fields are from."""
+        stamp = self("builtin_interfaces/msg/Time", sec=header.stamp.sec, nanosec=header.stamp.nanosec)
+        return self("std_msgs/msg/Header", stamp=stamp, frame_id=header.frame_id)
+
     @staticmethod
     def octets(data: bytes) -> array.array:
         return array.array("B", data)
@@ -83,7 +88,7 @@ def unheard(topic: str, say: Callable[[str, str], None]) -> SubscriptionEventCal
             f"nothing comes from it; change its, or qos_overrides.{topic}.subscription.{policy.lower()}",
         )
 
-    return SubscriptionEventCallbacks(incompatible_qos=on_event)
+    return SubscriptionEventCallbacks(incompatible_qos=on_event, use_default_callbacks=False)
 
 
 def unhearing(topic: str, say: Callable[[str, str], None]) -> PublisherEventCallbacks:
@@ -97,7 +102,7 @@ def unhearing(topic: str, say: Callable[[str, str], None]) -> PublisherEventCall
             f"it gets nothing; change its, or qos_overrides.{topic}.publisher.{policy.lower()}",
         )
 
-    return PublisherEventCallbacks(incompatible_qos=on_event)
+    return PublisherEventCallbacks(incompatible_qos=on_event, use_default_callbacks=False)
 
 
 def _policy(event) -> str:

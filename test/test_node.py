@@ -10,12 +10,13 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 from conftest import ROOT, LifterProcess, camera_info, header_of, persons_at, seen
+from foreign_messages import CLOUD, HRI, OPENDR, LiveMake, hri, opendr
 from foreign_messages import DEFINITIONS as FOREIGN
-from foreign_messages import HRI, OPENDR, LiveMake, hri, opendr
 from node_bench import GOOD, MAKE, PATIENCE, Bench, class_of, cloud, good, header_in, nobody, set_parameters
 
 import msg_adapters
@@ -386,17 +387,24 @@ def lifter_node(ros, monkeypatch):
     node.destroy_node()
 
 
+@dataclass
 class FrameThatCounts:
     """Stands in for a lifted frame: keeps the names of the messages it was asked for; one of them may fail."""
 
-    def __init__(self, faulty: str = "") -> None:
-        self.built, self.faulty = [], faulty
+    faulty: str = ""
+    header: object = field(default_factory=lambda: header_of(MAKE))
+    built: list = field(default_factory=list)
 
     def message(self, name, make):
         self.built.append(name)
         if name == self.faulty:
             raise ZeroDivisionError("on purpose")
         return make(OUTPUTS[name])
+
+    def serialised(self, name, writer):
+        from rclpy.serialization import serialize_message
+
+        return serialize_message(self.message(name, lambda type_name: class_of(type_name)()))
 
 
 def test_outputs_nobody_listens_to_are_not_built(ros, lifter_node):
@@ -514,6 +522,18 @@ def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):
     one_person(lifter_node, hri, 1, pose=POSES[0])
     lifter_node.flush()
     assert [frame.keypoints.ids for frame in published] == [("anna",)]
+
+
+def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
+    """What comes serialised from another distribution, or damaged."""
+    from rclpy.serialization import serialize_message
+
+    data = serialize_message(good()(header_of(MAKE)))
+    for part in (data[:40], data[:-1], b"", b"\0\1\0\0" + bytes(8) + b"\xff" * 60):
+        lifter_node._on_keypoints(CLOUD, part, "/keypoints", 0)
+    assert lifter_node.stream.drops == {"damaged_bytes": 4} and lifter_node.stream.counts["frames"] == 0
+    lifter_node._on_keypoints(CLOUD, data, "/keypoints", 0)
+    assert lifter_node.stream.counts["lifted"] == 1
 
 
 def test_parameter_file_and_table_come_from_one_place():

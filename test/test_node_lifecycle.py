@@ -153,7 +153,8 @@ def test_a_model_is_swapped_between_two_frames_and_none_is_lost(managed, other_m
     assert stamps == list(range(first, bench.stamp + 1))
     depth = {msg.header.stamp.sec: msg.poses[0].position.z for msg in bench.got["poses"] if msg.poses}
     near = [stamp for stamp in stamps if depth[stamp] < 6]
-    assert near == stamps[: len(near)] and asked <= near[-1] + 1 and near[-1] <= swapped
+    # What came before the request may wait while that is answered, but nothing of it is answered twice or out of turn.
+    assert near and near == stamps[: len(near)] and near[-1] <= swapped
     assert depth[first] == pytest.approx(4, abs=0.2) and depth[bench.stamp] == pytest.approx(8, abs=0.4)
     assert bench.layout()["model"] == "twice" and bench.units() == "m"
     told = bench.diagnosed()
@@ -224,9 +225,10 @@ def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeyp
     node.start()
     monkeypatch.setattr(node, "_publish", lambda frame: models.append(node.stream.lifter.model.name))
     node._on_keypoints(OPENDR, opendr(LiveMake(), header_of(MAKE), pose=POSES[0]), "/keypoints", 0)
+    before = node.stream.lifter.model.name
     assert not models
     assert node.set_parameters([Parameter("model", value=str(other_model))])[0].successful
-    assert models == ["human_coco17"] and node.stream.counts["frames"] == 1
+    assert models == [before] and node.stream.counts["frames"] == 1
     node.end()
     node.destroy_node()
 

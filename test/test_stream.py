@@ -18,7 +18,7 @@ from paul_ros.lifter import Lifter
 from paul_ros.model import ModelError, load_model
 from paul_ros.parameters import ParameterError
 from paul_ros.skeleton import Layout, LayoutError, load_layout
-from paul_ros.stream import OUTPUTS, LiftStream, open_stream
+from paul_ros.stream import OUTPUTS, PACKED, LiftStream, open_stream
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 GOOD = persons_at((0.3, 0, 4), (-1, 0.1, 5))
@@ -440,3 +440,18 @@ def test_smoothing_is_off_until_it_is_set(stream, make):
     # Bodies and roots stand where the filtered points do.
     np.testing.assert_allclose(frames[-1].lifted.root, smooth[-1][:, [11, 12]].mean(1))
     np.testing.assert_array_equal(answers(0.0)[0], raw)
+
+
+def test_bytes_in_and_out_say_the_same_as_messages(model_file, bag_make):
+    """PointCloud2 in, PoseArray and PointCloud2 out: one message with objects all the way, and the same serialised."""
+    store = bag_make.store
+    msg = outputs.keypoints_cloud(
+        bag_make, header_of(bag_make), seen(persons_at((0, 0, 4), (1, 0, 5))), np.ones((2, 17)), ["7", "9"]
+    )
+    data = bytes(store.serialize_cdr(msg, CLOUD))
+    frames = [open_stream(str(model_file)).keypoints(CLOUD, given) for given in (msg, data)]
+    for name, make_writer in PACKED.items():
+        kind = OUTPUTS[name]
+        told = bag_make.through_cdr(frames[0].message(name, bag_make))
+        packed = store.deserialize_cdr(frames[1].serialised(name, make_writer()), kind)
+        assert store.serialize_cdr(told, kind) == store.serialize_cdr(packed, kind)
