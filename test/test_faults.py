@@ -154,9 +154,9 @@ def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_pub
     """1000 Hz are more than one core may manage, and this process takes a message every 20 ms."""
     if not silent:
         bench.node.destroy_publisher(bench.keypoints)
-    flood = start_publisher(bench.lifter.namespace, 1000, 1_000_000, 3000)
+    flood = start_publisher(bench.lifter.namespace, 1000, 1_000_000, 1500)
     warm = flood.said()
-    while flood.process.poll() is None and len(heard(bench, 1_003_000)) < 2:
+    while flood.process.poll() is None and len(heard(bench, 1_001_500)) < 2:
         time.sleep(0.02)
         bench.ros.spin_once(bench.node, timeout_sec=0)
     sent = flood.said()
@@ -164,7 +164,7 @@ def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_pub
     frames, missed = int(found["frames"]), int(found.get("dropped_missed", 0))
     # One gap is taken for the first number of the other publisher; it is less than what waits in between.
     assert sent - warm - 50 * silent < frames + missed <= sent, found
-    assert frames > 300 and "dropped_internal_error" not in found
+    assert frames > 200 and "dropped_internal_error" not in found
 
 
 @pytest.mark.parametrize("topic", ["keypoints", "camera", "depth"])
