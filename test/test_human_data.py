@@ -20,7 +20,7 @@ from training import human_data
 from training.cameras import hidden_by_body, random_cameras
 from training.data import load_training_data
 from training.detector import detect, redefined, reported
-from training.human_data import other_people, recombined, see
+from training.human_data import other_people, see
 from training.mocap import CMU31, PARENTS, human_layout, human_mapping, human_points, layout_points
 from training.recipe import RecipeError
 from training.view_settings import COMPLETE, Views, ViewsError
@@ -148,30 +148,6 @@ def test_other_people_keep_their_poses(joints):
     assert 1.1 < np.median(ratio) < 1.4 and np.std(np.log(ratio)) > 0.1
     same = replace(Views(), stature=0.0, proportions=0.0, forearm=(1.0, 1.0))
     np.testing.assert_allclose(other_people(joints, same, np.random.default_rng(0)), joints, atol=1e-9)
-
-
-def test_limbs_come_from_other_poses_as_they_stand_to_the_body(joints):
-    """Angles between limb and trunk are those of some pose in the pool; the trunk stays; nobody is bent at share 0."""
-    rng, every = np.random.default_rng(0), replace(Views(), recombined=1.0)
-    mixed = recombined(joints, joints, every, rng)
-    trunk = [CMU31.index(name) for name in ("root", "lowerback", "thorax", "head", "lclavicle", "rclavicle")]
-    np.testing.assert_array_equal(mixed[:, trunk], joints[:, trunk])
-
-    def to_trunk(bodies, ends, trunk):
-        a, b, c, d = (bodies[:, CMU31.index(name)] for name in (*ends, *trunk))
-        return ((b - a) * (d - c)).sum(1) / np.linalg.norm(b - a, axis=1) / np.linalg.norm(d - c, axis=1)
-
-    for ends, trunk in (
-        (("lfemur", "ltibia"), ("root", "lowerback")),
-        (("rhumerus", "rradius"), ("lowerback", "thorax")),
-    ):
-        found, known = (to_trunk(bodies, ends, trunk) for bodies in (mixed, joints))
-        assert np.abs(found[:, None] - known).min(1).max() < 1e-9 and np.abs(found - known).mean() > 0.05
-    some = recombined(joints, joints, replace(Views(), recombined=0.3), rng)
-    knee, elbow = (CMU31.index(name) for name in ("lfemur", "lhumerus"))
-    for joint in (knee, elbow):
-        assert 0.2 < (some[:, joint] != joints[:, joint]).any(1).mean() < 0.4
-    np.testing.assert_array_equal(recombined(joints, joints, replace(Views(), recombined=0.0), rng), joints)
 
 
 # --- cameras

@@ -205,54 +205,6 @@ def other_people(joints: np.ndarray, views: Views, rng: np.random.Generator) -> 
     return grown
 
 
-def recombined(joints: np.ndarray, pool: np.ndarray, views: Views, rng: np.random.Generator) -> np.ndarray:
-    """The poses (F,31,3) with the legs of some, and the arms of some, taken from other poses of the pool (n,31,3).
-
-    As these stand to their own pelvis and chest: what people do with arms and legs goes together in ever new ways, more
-    than any archive holds.
-    """
-    mixed = np.array(joints, dtype=float)
-    for axes, limbs in ((_pelvis, _LEGS), (_chest, _ARMS)):
-        other = pool[rng.integers(len(pool), size=len(joints))]
-        taken = rng.random(len(joints)) < views.recombined
-        turn = axes(other).transpose(0, 2, 1) @ axes(joints)
-        for anchor, points in limbs:
-            limb = (other[:, points] - other[:, [anchor]]) @ turn + joints[:, [anchor]]
-            mixed[np.ix_(taken, points)] = limb[taken]
-    return mixed
-
-
-def _limb(side: str, anchor: str, *bones: str) -> tuple[int, list[int]]:
-    """A joint that stays, and the joints that go with another's."""
-    return CMU31.index(anchor), [CMU31.index(side + bone) for bone in bones]
-
-
-_LEGS = [_limb(side, "root", "hipjoint", "femur", "tibia", "foot", "toes") for side in "lr"]
-_ARMS = [_limb(side, f"{side}clavicle", "humerus", "radius", "wrist", "hand", "fingers", "thumb") for side in "lr"]
-
-
-def _pelvis(joints: np.ndarray) -> np.ndarray:
-    """Axes (F,3,3) in rows: to the left, up, forward."""
-    return _axes(joints, ("lhipjoint", "rhipjoint"), ("root", "lowerback"))
-
-
-def _chest(joints: np.ndarray) -> np.ndarray:
-    """Axes (F,3,3) in rows: to the left, up, forward."""
-    return _axes(joints, ("lclavicle", "rclavicle"), ("lowerback", "thorax"))
-
-
-def _axes(joints: np.ndarray, across: tuple[str, str], along: tuple[str, str]) -> np.ndarray:
-    left, right, low, high = (joints[:, CMU31.index(name)] for name in (*across, *along))
-    up = _unit(high - low)
-    lateral = left - right
-    lateral = _unit(lateral - (lateral * up).sum(1, keepdims=True) * up)
-    return np.stack([lateral, up, np.cross(lateral, up)], axis=1)
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
-
-
 @dataclass(frozen=True)
 class Seen:
     """N views of bodies, in the order of the layout ``human``.
@@ -356,8 +308,7 @@ def make(
     joints = np.concatenate([joints[distinct_frames(joints, views.motion)] for _, joints in clips])
     parts, drawn = [], views.views * len(joints)
     for number, block in enumerate(_blocks(len(joints), views.views)):
-        bodies = other_people(recombined(joints[block], joints, views, rng), views, rng)
-        seen = see(human_points(bodies), views, rng)
+        seen = see(human_points(other_people(joints[block], views, rng)), views, rng)
         enough = enough_visible(seen.visible, human_layout())
         parts.append(tuple(array[enough] for array in (seen.W, seen.visible, seen.marked, seen.S)))
         progress(min(1.0, (number + 1) * _BLOCK / drawn))

@@ -14,7 +14,7 @@ COMPLETE = "complete"
 """In place of a layout: a detector of all points of ``human``."""
 
 _RANGES = ("forearm", "distance", "height", "elevation", "field", "level", "hidden")
-_SHARES = ("recombined", "aloft", "tilted", "obstacle", "guessed", "min_confidence")
+_SHARES = ("aloft", "tilted", "obstacle", "guessed", "min_confidence")
 
 
 class ViewsError(ValueError):
@@ -30,7 +30,6 @@ class Views:
 
     # What is looked at
     motion: float = 10.0  # a frame is taken once a limb has turned by this much since the last one taken
-    recombined: float = 0.5  # share of bodies with the legs of another frame's, and again of those with another's arms
     views: int = 6  # cameras a frame, each of another person, at another place, with another detector
     stature: float = 0.06  # standard deviation of the logarithm of a factor on the whole body
     proportions: float = 0.04  # the same for each of thighs, shanks, feet, hips, trunk, neck, shoulders and upper arms
