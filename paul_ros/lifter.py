@@ -21,7 +21,7 @@ TOO_FAR = "too_far"
 AMBIGUOUS = 0.9
 """From this ambiguity on the depth-reversed pose explains the image nearly as well."""
 
-_WILD, _WILD_EXTENT = 3.0, 0.25
+_WILD, _WILD_EXTENT = 3.0, 0.35
 """A point is taken for a misdetection where it is missed by more than so many medians of the person's points, and by
 more than this share of the person's extent (some 8 % of the height)."""
 
