@@ -56,8 +56,8 @@ class Recipe:
     regression_steps: int = 0  # that they learn them for
     steps: int = 20_000  # of the objective; 0: the shapes of the start are the result
     hold: int = 0  # steps that the lower level's solutions of all frames are held for, while the networks learn them as
-    # the cameras of other frames see them (beyond the paper; without perspective, though the data have it); 0: solved
-    # anew for every batch, as the paper does
+    # the cameras of other frames see them, and their detectors where the data has detections (beyond the paper); 0:
+    # solved anew for every batch, as the paper does
     generations: int = 1  # of networks; each but the first starts from what the last one made of the frames, less the
     # tenth that it explained worst: most frames that show the wrong mirror image are among those
     batch: int = 256  # 0: all frames at every step
