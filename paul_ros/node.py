@@ -521,8 +521,20 @@ def main() -> int:
     return 0
 
 
+class _OneThread(SingleThreadedExecutor):
+    """Waits once for a message, not twice.
+
+    rclpy's executor wakes itself after every callback, for other threads that may wait for the same callback group: it
+    gathers all entities and waits a second time for nothing. Where there is one thread no one else waits.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._guard.trigger = lambda: None
+
+
 def _spin(node: LifterNode, stop: threading.Event) -> None:
-    executor = SingleThreadedExecutor()
+    executor = _OneThread()
     executor.add_node(node)
     # Not spin_once's own timeout: that makes and destroys a timer each time.
     node.create_timer(_STOP_SECONDS, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))

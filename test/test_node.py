@@ -524,6 +524,28 @@ def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):
     assert [frame.keypoints.ids for frame in published] == [("anna",)]
 
 
+def test_the_executor_waits_once_for_a_callback(lifter_node, monkeypatch):
+    """rclpy's own waits a second time after each."""
+    import rclpy.executors
+
+    from paul_ros.node import _OneThread
+
+    waits, count = [], rclpy.executors.NumberOfEntities
+    monkeypatch.setattr(rclpy.executors, "NumberOfEntities", lambda *sizes: waits.append(sizes) or count(*sizes))
+    found = []
+    for kind in (_OneThread, rclpy.executors.SingleThreadedExecutor):
+        executor, ticks = kind(), []
+        executor.add_node(lifter_node)
+        timer = lifter_node.create_timer(0.02, lambda ticks=ticks: ticks.append(1))
+        waits.clear()
+        while len(ticks) < 20:
+            executor.spin_once()
+        found.append(len(waits))
+        lifter_node.destroy_timer(timer)
+        executor.shutdown()
+    assert found[0] < 0.75 * found[1]
+
+
 def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
     """What comes serialised from another distribution, or damaged."""
     from rclpy.serialization import serialize_message
