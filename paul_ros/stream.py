@@ -36,7 +36,7 @@ _BONE_WIDTH = 0.01
 #: Why a person is left out.
 _LEFT_OUT = {
     TOO_FEW_POINTS: "too few of its keypoints are visible",
-    DEGENERATE_POINTS: "its keypoints lie on one line or within about a pixel",
+    DEGENERATE_POINTS: "its keypoints lie on one line, in two places or within about a pixel",
     TOO_FAR: f"it would stand more than {MAX_DISTANCE:.0f} m away; if it does not, check camera_info",
 }
 

@@ -144,6 +144,31 @@ def test_hidden_points_do_not_add_to_a_persons_extent(model):
     assert Lifter(model).lift(xy, visible, CAMERA).reason == (DEGENERATE_POINTS,)
 
 
+@pytest.mark.parametrize("camera", [CAMERA, None])
+@pytest.mark.parametrize("breadth, fixed", [(0.0, False), (0.004, False), (0.006, True)])
+def test_persons_on_one_line_are_refused(model, camera, breadth, fixed):
+    """However it slants; the spread across it is a share of that along it. They had a certificate and no ambiguity."""
+    rng = np.random.default_rng(0)
+    flat = rng.normal(size=(20, 17, 2))
+    flat -= flat.mean(1, keepdims=True)
+    flat = flat @ np.linalg.svd(flat, full_matrices=False)[2].transpose(0, 2, 1)
+    flat *= np.array([1, breadth]) / np.sqrt((flat * flat).mean(1, keepdims=True))
+    turns = Rotation.from_rotvec(rng.uniform(0, np.pi, (20, 1)) * [0, 0, 1]).as_matrix()[:, :2, :2]
+    xy = (640, 360) + 80 * flat @ turns
+    assert set(Lifter(model.rigid()).lift(xy, everything(xy), camera).reason) == {"" if fixed else DEGENERATE_POINTS}
+
+
+@pytest.mark.parametrize("camera", [CAMERA, None])
+def test_persons_in_two_places_are_refused(model, camera):
+    xy = np.where(np.arange(17)[:, None] < 5, (600.0, 300.0), (650.0, 400.0))[None]
+    assert Lifter(model).lift(xy, everything(xy), camera).reason == (DEGENERATE_POINTS,)
+
+
+def test_persons_seen_from_the_side_are_lifted(rigid_lifter, model):
+    truth = np.concatenate([standing(model, [0, 0, 5], turn) for turn in np.linspace(0, np.pi, 37)])
+    assert rigid_lifter.lift(pinhole(truth), everything(truth), CAMERA).ok.all()
+
+
 @pytest.mark.parametrize("distance, reason", [(180, ""), (220, TOO_FAR)])
 def test_persons_are_lifted_up_to_a_stated_distance(rigid_lifter, model, distance, reason):
     truth = standing(model, [0, 0, distance])
