@@ -464,6 +464,27 @@ def test_the_command_says_what_is_wrong(archive, tmp_path):
         assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and told in wrong.stderr, wrong.stderr
 
 
+def test_the_command_overwrites_nothing_that_it_reads_or_writes(archive, tmp_path):
+    """Refused before anything is read, and nothing is left behind."""
+    capture, out = archive / "subject_90.npz", tmp_path / "2d.npz"
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "a.npz").symlink_to(capture)
+    before = capture.read_bytes()
+    for arguments, told in (
+        ((archive, "-o", capture), "read as motion capture"),
+        ((archive, "-o", archive / "new.npz"), "read as motion capture"),
+        ((archive, "-o", out, "--truth", archive / "3d.npz"), "read as motion capture"),
+        ((tmp_path / "linked", "-o", capture), "is what is read"),
+        ((archive, "-o", out, "--truth", tmp_path / "linked" / ".." / "2d.npz"), "named for two outputs"),
+        ((archive, "-o", tmp_path / "views.txt"), "must end in .npz, not 'views.txt'"),
+        ((archive, "-o", out, "--truth", tmp_path / "truth"), "must end in .npz, not 'truth'"),
+        ((archive, "-o", tmp_path / "typo" / "2d.npz"), "there is no folder"),
+    ):
+        wrong = command(*arguments)
+        assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and told in wrong.stderr, wrong.stderr
+    assert capture.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["archive", "linked"]
+
+
 def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, capsys):
     """And the same command goes on with the views that it made."""
     from training import cli

@@ -17,7 +17,7 @@ import hashlib
 import io
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ import numpy as np
 from tqdm import tqdm
 
 from msg_adapters.keypoints import Intrinsics
+from paul_ros.bag import BagError, check_outputs
 from paul_ros.files import NpzError, read_npz, write_atomically
 from paul_ros.model import enough_visible
 from paul_ros.placement import centred_view
@@ -391,14 +392,34 @@ def main() -> int:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     args = parser.parse_args()
     try:
-        make_file(args.folder, views_of(Recipe.load(args.recipe, args.set)), args.output, args.truth, args.quiet)
+        views = views_of(Recipe.load(args.recipe, args.set))
+        _check_files(args.folder, (args.output, args.truth), args.recipe)
+        make_file(args.folder, views, args.output, args.truth, args.quiet)
         detected = read_npz(args.output, ("detected",))["detected"]
-    except (MocapError, RecipeError, OSError, NpzError) as error:
+    except (MocapError, RecipeError, BagError, OSError, NpzError) as error:
         print(f"human_data: {error}", file=sys.stderr)
         return 1
     missing = np.isnan(detected[:, 0]).mean()
     print(f"{args.output}: {len(detected)} frames, {missing:.0%} of the points not detected")
     return 0
+
+
+def _check_files(folder: Path, outputs: tuple[Path | None, ...], recipe: str) -> None:
+    """Raises MocapError or BagError where an output cannot be written or would cost what is read or another output."""
+    for path in filter(None, outputs):
+        if path.suffix != ".npz":
+            raise MocapError(f"the file must end in .npz, not '{path.name}'")
+        if not path.parent.is_dir():
+            raise MocapError(f"cannot write {path}: there is no folder '{path.parent}'; make it first")
+    check_outside(folder, outputs)
+    check_outputs(outputs, [*_files(folder), recipe])
+
+
+def check_outside(folder: Path, outputs: Iterable[Path | None]) -> None:
+    """Raises MocapError for an output in the folder of motion capture, where the next run would take it for some."""
+    for path in filter(None, outputs):
+        if folder.resolve() in path.resolve().parents:
+            raise MocapError(f"{path} lies in '{folder}' and would be read as motion capture; write it elsewhere")
 
 
 def views_of(recipe: Recipe) -> Views:
