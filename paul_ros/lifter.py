@@ -17,6 +17,7 @@ from paul_ros.refine import refine
 TOO_FEW_POINTS = "too_few_points"
 DEGENERATE_POINTS = "degenerate_points"
 TOO_FAR = "too_far"
+BEHIND_CAMERA = "behind_camera"
 
 AMBIGUOUS = 0.9
 """From this ambiguity on the depth-reversed pose explains the image nearly as well."""
@@ -36,6 +37,9 @@ _LINE = 0.005
 """Points are on one line where they spread across it by less than this share of their spread along it, root mean
 squares both: of 0.3 pixels, what rounding to whole ones makes, on 60. The persons of the bags, some of them seen from
 the side and half hidden, have 0.028 and more."""
+
+_FARTHEST_PIXEL = 1e6
+"""No image is that large: what lies farther out was not seen, and squares of it need not be numbers."""
 
 MAX_DISTANCE = 200.0
 """Metres: there a grown person's points keep about 1.5 pixels of extent for 900 pixels of focal length."""
@@ -63,7 +67,9 @@ class Lifted:
             where the lifted shape has them that a detector must have been wrong.
         reason: N slugs, '' where lifted, else why not: ``too_few_points``, fewer visible than the model asks for;
             ``degenerate_points``, they fix no pose: all on one line or in two places or, with intrinsics, an rms extent
-            below ``MIN_EXTENT``; ``too_far``, in metres a coordinate would exceed ``MAX_DISTANCE``.
+            below ``MIN_EXTENT``; ``too_far``, in metres a coordinate would exceed ``MAX_DISTANCE``; ``behind_camera``,
+            the root, or in metres a point used, would not be in front of the camera. Points that were not used may be
+            behind it, as the feet of somebody close by, seen by a camera that looks up.
         units: ``"m"`` or ``"model"``.
     """
 
@@ -128,7 +134,7 @@ class Lifter:
 
         Args:
             xy: (N,P,2) pixels in the model's layout; anything, NaN too, where hidden.
-            visible: (N,P) bool.
+            visible: (N,P) bool; points more than a million pixels out count as hidden.
             camera: intrinsics of the (rectified) image; with them, and a model that knows its metres per unit, the
                 output is in metres.
 
@@ -153,7 +159,7 @@ class Lifter:
                 f"lift needs xy (N,{P},2) and visible (N,{P}) in layout '{self.model.layout.name}', "
                 f"got {xy.shape} and {visible.shape}"
             )
-        return xy, visible & np.isfinite(xy).all(2)
+        return xy, visible & (np.abs(xy) <= _FARTHEST_PIXEL).all(2)
 
     def _lift_seen(self, xy: np.ndarray, visible: np.ndarray, camera: Intrinsics | None) -> Lifted:
         """Persons of whom enough points are visible."""
@@ -186,10 +192,14 @@ class Lifter:
             reason=("",) * len(xy),
             units=units,
         )
-        done = enough & fixed & near
+        front = fit.T[:, 2] > 0
+        if units == "m":
+            front &= (root[:, 2] > 0) & ((points[..., 2] > 0) | ~fit.used).all(1)
+        done = enough & fixed & near & front
         if done.all():
             return lifted
-        why = np.where(~enough, TOO_FEW_POINTS, np.where(~fixed, DEGENERATE_POINTS, TOO_FAR))[~done]
+        placed = np.where(near, BEHIND_CAMERA, TOO_FAR)
+        why = np.where(~enough, TOO_FEW_POINTS, np.where(~fixed, DEGENERATE_POINTS, placed))[~done]
         nothing = _nothing(len(why), visible.shape[1], units)
         return _replaced(lifted, ~done, replace(nothing, reason=tuple(why.tolist())))
 

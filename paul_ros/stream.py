@@ -22,7 +22,7 @@ from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPoi
 from msg_adapters.cdr import CloudReader, CloudWriter, PoseArrayWriter
 from paul_ros.bodies import Steady, body_rotations, left_and_up, quaternions
 from paul_ros.depth import SURFACE, Depths
-from paul_ros.lifter import DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
+from paul_ros.lifter import BEHIND_CAMERA, DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
 from paul_ros.model import load_model
 from paul_ros.parameters import checked
 from paul_ros.route import MODEL, Route, read_unknown
@@ -38,6 +38,7 @@ _LEFT_OUT = {
     TOO_FEW_POINTS: "too few of its keypoints are visible",
     DEGENERATE_POINTS: "its keypoints lie on one line, in two places or within about a pixel",
     TOO_FAR: f"it would stand more than {MAX_DISTANCE:.0f} m away; if it does not, check camera_info",
+    BEHIND_CAMERA: "it would stand beside or behind the camera; check camera_info and the layout of the keypoints",
 }
 
 _log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from conftest import coco_model, persons_at
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.keypoints import Intrinsics
-from paul_ros.lifter import DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS, Lifter
+from paul_ros.lifter import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS, Lifter
 from paul_ros.model import ModelError, load_model
 from paul_ros.placement import centred_view
 
@@ -174,6 +174,31 @@ def test_persons_are_lifted_up_to_a_stated_distance(rigid_lifter, model, distanc
     truth = standing(model, [0, 0, distance])
     lifted = rigid_lifter.lift(pinhole(truth), everything(truth), CAMERA)
     assert lifted.reason == (reason,) and np.isfinite(lifted.points).all() == (reason == "")
+
+
+def test_who_is_lifted_is_in_front_of_the_camera(model):
+    """Points all over a field of nearly 180 degrees: lifted shapes reach behind the camera, some with their roots."""
+    wide = Intrinsics(90.0, 90.0, 640.0, 360.0, 1280, 720)
+    xy = np.random.default_rng(0).uniform(-1400, 2700, (500, 17, 2))
+    lifted = Lifter(model).lift(xy, everything(xy), wide)
+    assert set(lifted.reason) >= {"", BEHIND_CAMERA}
+    assert lifted.root[lifted.ok, 2].min() > 0
+    assert lifted.points[lifted.used & lifted.ok[:, None], 2].min() > 0
+    behind = np.array(lifted.reason) == BEHIND_CAMERA
+    assert np.isnan(lifted.points[behind]).all() and not lifted.certified[behind].any()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("camera", [CAMERA, None])
+@pytest.mark.parametrize("far", [1.1e6, -1e155, 1e305, np.inf])
+def test_points_where_no_image_is_count_as_hidden(model, camera, far):
+    truth = standing(model, [0, 0, 5])
+    xy, visible = pinhole(truth), everything(truth)
+    xy[0, :3, 1] = far
+    visible[0, :3] = False
+    np.testing.assert_array_equal(
+        Lifter(model).lift(xy, everything(truth), camera).points, Lifter(model).lift(xy, visible, camera).points
+    )
 
 
 def test_without_intrinsics_there_is_no_distance_to_exceed(rigid_lifter, model):
