@@ -42,7 +42,7 @@ class OneEuro:
     def __init__(self, cutoff: float = 0.0) -> None:
         self.cutoff = cutoff
         self._tracks: dict[str, _Track] = {}
-        self._stamp, self._units = 0, ""
+        self._stamp, self._units, self._swept = 0, "", 0
 
     def __call__(self, ids: tuple[str, ...], stamp: int, lifted: Lifted, root: tuple[int, ...]) -> Lifted:
         """Persons with their points filtered, and their roots, means of the points `root`; without an id as they are.
@@ -52,6 +52,7 @@ class OneEuro:
         if stamp < self._stamp or lifted.units != self._units or not self.cutoff:
             self._tracks.clear()
         self._stamp, self._units = stamp, lifted.units
+        self._sweep()
         if not self.cutoff:
             return lifted
         points, roots = lifted.points.copy(), lifted.root.copy()
@@ -61,6 +62,13 @@ class OneEuro:
                 points[row] = track.points
                 roots[row] = track.points[list(root)].mean(0)
         return replace(lifted, points=points, root=roots)
+
+    def _sweep(self) -> None:
+        """Forgets the persons who left, from time to time: detectors count ids upwards for as long as they run."""
+        longest = int(FORGET_SECONDS * 1e9)
+        if not 0 <= self._stamp - self._swept <= longest:
+            self._swept = self._stamp
+            self._tracks = {name: track for name, track in self._tracks.items() if self._stamp - track.stamp <= longest}
 
     def _step(self, track: _Track | None, stamp: int, points: np.ndarray) -> _Track:
         seconds = (stamp - track.stamp) / 1e9 if track else 0.0
