@@ -47,9 +47,9 @@ class OneEuro:
     def __call__(self, ids: tuple[str, ...], stamp: int, lifted: Lifted, root: tuple[int, ...]) -> Lifted:
         """Persons with their points filtered, and their roots, means of the points `root`; without an id as they are.
 
-        All start anew where time runs backwards, as when a bag loops, or the units are others.
+        All start anew where time runs backwards, as when a bag loops, or is not told (0), or the units are others.
         """
-        if stamp < self._stamp or lifted.units != self._units or not self.cutoff:
+        if stamp < self._stamp or not stamp or lifted.units != self._units or not self.cutoff:
             self._tracks.clear()
         self._stamp, self._units = stamp, lifted.units
         self._sweep()

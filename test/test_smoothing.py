@@ -114,9 +114,10 @@ def test_a_stamp_that_repeats_breaks_nothing():
     assert np.isfinite(filtered(("1", "1"), 2 * FRAME, lifted(np.repeat(raw[3], 2, 0)), HIPS).points).all()
 
 
-def test_persons_who_left_are_forgotten():
-    """An id of its own in every frame: what is kept does not grow with time, whatever else is kept."""
+@pytest.mark.parametrize("step", [FRAME, 0])
+def test_persons_who_left_are_forgotten(step):
+    """An id of its own in every frame, with stamps and without: what is kept does not grow with time."""
     filtered, raw = OneEuro(1.0), lifted(noisy(1)[0].repeat(2, 0))
     for n in range(300):
-        filtered(("stays", str(n)), n * FRAME, raw, HIPS)
+        filtered(("stays", str(n)), n * step, raw, HIPS)
     assert "stays" in filtered._tracks and len(filtered._tracks) < 2 + 2 * FORGET_SECONDS * 30
