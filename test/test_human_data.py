@@ -16,12 +16,12 @@ from msg_adapters.keypoints import Intrinsics
 from paul_ros.model import load_model
 from paul_ros.placement import centred_view
 from paul_ros.skeleton import LayoutError, load_layout
-from training import human_data
+from training import cli, human_data
 from training.cameras import hidden_by_body, random_cameras
 from training.data import load_training_data
 from training.detector import detect, redefined, reported
 from training.human_data import other_people, see
-from training.mocap import CMU31, PARENTS, human_layout, human_mapping, human_points, layout_points
+from training.mocap import CMU31, PARENTS, MocapError, human_layout, human_mapping, human_points, layout_points
 from training.recipe import RecipeError
 from training.view_settings import COMPLETE, Views, ViewsError
 
@@ -485,15 +485,28 @@ def test_the_command_overwrites_nothing_that_it_reads_or_writes(archive, tmp_pat
     assert capture.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["archive", "linked"]
 
 
-def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, capsys):
-    """And the same command goes on with the views that it made."""
-    from training import cli
-
+def arguments_of_train(*words):
     parser = argparse.ArgumentParser()
     cli.add_arguments(parser)
-    small = ["--set", "steps=2", "--set", "batch=16", "--set", "views.views=1", "--quiet", "--recipe", "human"]
+    return parser.parse_args([*map(str, words)])
+
+
+@pytest.mark.parametrize("option", ["-o", "--shapes"])
+def test_nothing_is_written_into_the_folder_that_is_read(archive, option):
+    """Once written, model and views would be read as motion capture by the same command."""
+    (archive / "below").mkdir()
+    for output in (archive / "human.npz", archive / "below" / ".." / "below" / "human.npz"):
+        with pytest.raises(MocapError, match="would be read as motion capture; write it elsewhere"):
+            cli.run(arguments_of_train(archive, option, output, "--recipe", "human"))
+    assert sorted(path.name for path in archive.rglob("*")) == ["below", "subject_90.npz"]
+
+
+def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, capsys):
+    """And the same command goes on with the views that it made."""
+    settings = ("views.views=1", "steps=2", "batch=16", "start=random", "regression_steps=0", "hold=0", "width=16")
+    small = [*(word for setting in settings for word in ("--set", setting)), "--quiet", "--recipe", "human"]
     monkeypatch.setattr(sys, "argv", ["paul", "train"])
-    args = parser.parse_args([str(archive), "-o", str(tmp_path / "human.npz"), *small])
+    args = arguments_of_train(archive, "-o", tmp_path / "human.npz", *small)
     assert cli.run(args) == 0
     model = load_model(tmp_path / "human.npz")
     assert model.layout.name == "human" and model.min_visible == 6
@@ -501,6 +514,5 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
     views = tmp_path / "human.run" / "views.npz"
     made = views.stat().st_mtime_ns
     assert cli.run(args) == 0 and views.stat().st_mtime_ns == made
-    args = parser.parse_args([str(archive), "-o", str(tmp_path / "x.npz"), "--quiet"])
     with pytest.raises(RecipeError, match="--recipe human"):
-        cli.run(args)
+        cli.run(arguments_of_train(archive, "-o", tmp_path / "x.npz", "--quiet"))

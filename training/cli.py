@@ -27,7 +27,7 @@ from training.data import DataError, TrainingData, check_sizes
 from training.distributed import is_first, joined
 from training.encoder_fit import fit_encoder
 from training.export import architecture, export_model
-from training.human_data import make_file, motion_files, views_of
+from training.human_data import check_outside, make_file, motion_files, views_of
 from training.mocap import MocapError
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.reconstruction import Run, reconstruction_of, restarts, run_folder, train_restarts
@@ -155,20 +155,22 @@ def _unused(data: TrainingData, recipe: Recipe) -> tuple[str, ...]:
 def _load(args: argparse.Namespace, recipe: Recipe) -> tuple[TrainingData, Recipe]:
     """The data, and the recipe, which keeps its views only where they are taken: of a folder of motion capture."""
     layout, paths = args.layout, args.data
-    if len(paths) != 1 or not _is_motion_capture(Path(paths[0])):
+    if not (capture := _motion_capture(args)):
         recipe = replace(recipe, views=None)
     else:
         views = _folder(args) / VIEWS
         if args.fresh:
             views.unlink(missing_ok=True)
-        make_file(Path(paths[0]), views_of(recipe), views, quiet=args.quiet)
+        make_file(capture, views_of(recipe), views, quiet=args.quiet)
         layout, paths = layout or "human", [views]
     return load_files(paths, load_layout(layout) if layout else None, args.topic, args.min_confidence), recipe
 
 
-def _is_motion_capture(path: Path) -> bool:
-    """A folder of it, not a bag's."""
-    return path.is_dir() and not (path / "metadata.yaml").exists() and bool(motion_files(path))
+def _motion_capture(args: argparse.Namespace) -> Path | None:
+    """The data, where it is a folder of motion capture, not a bag's."""
+    path = Path(args.data[0])
+    one = len(args.data) == 1 and path.is_dir() and not (path / "metadata.yaml").exists()
+    return path if one and motion_files(path) else None
 
 
 def _folder(args: argparse.Namespace) -> Path:
@@ -182,6 +184,8 @@ def _run_folders(args: argparse.Namespace, recipe: Recipe) -> list[Path]:
     for path in filter(None, (args.output, args.shapes)):
         if path.suffix != ".npz":
             raise DataError(f"the file must end in .npz, not '{path.name}'")
+    if capture := _motion_capture(args):
+        check_outside(capture, (args.output, args.shapes, args.json))
     folders = [run_folder(_folder(args), recipe, one.seed) for one in restarts(recipe)]
     kept = [folder / name for folder in folders for name in (CHECKPOINT, LOG, START)]
     check_outputs([args.output, args.shapes, args.json, *kept], [*args.data, args.recipe, args.layout])
