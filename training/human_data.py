@@ -333,15 +333,19 @@ def _blocks(frames: int, times: int) -> Iterator[slice]:
         yield from (slice(begin, begin + _BLOCK) for begin in range(0, frames, _BLOCK))
 
 
+FORMAT = 1
+"""Of the views: raised whenever the same files and settings come to give others, so that kept ones are made anew."""
+
+
 def make_file(folder: Path, views: Views, path: Path, truth: Path | None = None, quiet: bool = False) -> None:
     """Write the training file of a folder of motion capture, and the truth if it is named.
 
-    A file that was made from the same files with the same settings is left as it is.
+    A file that was made by this format, from files of the same names and contents with the same settings, is left.
 
     Raises:
         MocapError: the folder holds none, or a file of it cannot be used.
     """
-    made = {"files": _digest(folder), "views": views.to_dict()}
+    made = {"format": FORMAT, "files": _digest(folder), "views": views.to_dict()}
     if truth is None and _made_of(path) == made:
         return
     with _bar("motion capture", quiet) as progress:
@@ -358,16 +362,30 @@ def make_file(folder: Path, views: Views, path: Path, truth: Path | None = None,
 
 
 def _digest(folder: Path) -> str:
-    """Of the names and sizes of the files."""
-    listed = [f"{file.relative_to(folder)} {file.stat().st_size}" for file in _files(folder)]
-    return hashlib.sha256("\n".join(listed).encode()).hexdigest()
+    """Of the names and contents of the files, skeletons included; raises MocapError."""
+    whole = hashlib.sha256()
+    for file in (*_files(folder), *sorted(folder.rglob("*.asf"))):
+        whole.update(f"{file.relative_to(folder)}\n{_content(file)}\n".encode())
+    return whole.hexdigest()
+
+
+def _content(file: Path) -> str:
+    """A digest of one file, which need not fit into memory."""
+    digest = hashlib.sha256()
+    try:
+        with file.open("rb") as stream:
+            while part := stream.read(1 << 20):
+                digest.update(part)
+    except OSError as error:
+        raise MocapError(f"{file}: cannot be read: {error.strerror}") from None
+    return digest.hexdigest()
 
 
 def _made_of(path: Path) -> dict | None:
     """Of what a file was made, if it is there and says so."""
     try:
         about = json.loads(read_npz(path, ("about",))["about"].tobytes())
-        return {"files": about["files"], "views": about["views"]}
+        return {name: about[name] for name in ("format", "files", "views")}
     except (NpzError, ValueError, KeyError, TypeError):
         return None
 
