@@ -13,6 +13,7 @@ from paul_ros.model import Model, ModelError, RigidModel, enough_visible
 from paul_ros.onp import onp
 from paul_ros.placement import centred_view, place
 from paul_ros.refine import refine
+from paul_ros.skeleton import middles
 
 TOO_FEW_POINTS = "too_few_points"
 DEGENERATE_POINTS = "degenerate_points"
@@ -52,7 +53,8 @@ class Lifted:
     Attributes:
         points: (N,P,3) camera optical frame (x right, y down, z forward). In metres from the camera's centre where
             ``units`` is ``"m"``; else in model units from the root. NaN for persons that were not lifted.
-        root: (N,3) the layout's root point, same frame and units.
+        root: (N,3) the layout's root point, same frame and units: of a shipped layout the middle of the hips in
+            ``points``, but where a pelvis was seen beside a hidden hip.
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
         reprojection: (N,) pixels, root mean square over the points used.
@@ -106,6 +108,7 @@ class Lifter:
             )
         self.model = model
         self.person_height = person_height
+        self._middles = middles(model.layout)
 
     @property
     def person_height(self) -> float:
@@ -170,6 +173,7 @@ class Lifter:
         fit = self._fit_sure(W, visible, camera is not None)
         root, units, near = list(self.model.layout.root), self._units(camera), np.True_
         shape = self._as_seen(fit, camera is not None)
+        self._place_middles(shape, fit.used)
         if units == "m":
             points = place(shape + fit.T[:, :, None], turn, self.metres_per_unit)
             near = (np.abs(points) <= MAX_DISTANCE).all((1, 2))
@@ -216,6 +220,15 @@ class Lifter:
         square = np.maximum(fit.square * depth * depth, 1e-300)
         shape[:, :2] += (np.minimum(1.0, (2 * self.model.misfit) ** 2 / square) * depth)[:, None] * fit.missed
         return shape
+
+    def _place_middles(self, shape: np.ndarray, used: np.ndarray) -> None:
+        """Puts points that are middles of others there, in shapes (N,3,P), where they were not seen or the others were.
+
+        So the root of a person is in the middle of its hips; a pelvis that was seen beside a hidden hip stays.
+        """
+        for point, parts in self._middles.items():
+            known = ~used[:, point] | used[:, parts].all(1)
+            shape[known, :, point] = shape[known][:, :, parts].mean(2)
 
     def _sigma(self, root: np.ndarray, fit: _Fit, units: str) -> np.ndarray:
         if units != "m":

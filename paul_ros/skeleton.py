@@ -238,6 +238,23 @@ def layout_names() -> tuple[str, ...]:
     return tuple(sorted(file.name[:-5] for file in _SHIPPED.iterdir() if file.name.endswith(".yaml")))
 
 
+def middles(layout: Layout) -> dict[int, tuple[int, ...]]:
+    """Points of a shipped layout that others derive from points which it has too: point -> those it is the mean of.
+
+    So are pelvis and neck of `human` the middles of hips and shoulders. Of a user's layout nothing is known: the same
+    names may be of an animal, whose neck is elsewhere.
+    """
+    if layout.name not in layout_names() or layout.names != load_layout(layout.name).names:
+        return {}
+    place, found = {name: index for index, name in enumerate(layout.names)}, {}
+    for other in map(load_layout, layout_names()):
+        for name, parts in other.derived.items():
+            named = other._named(parts)
+            if name in place and place.keys() >= set(named):
+                found[place[name]] = tuple(place[part] for part in named)
+    return found
+
+
 def anonymous_layout(points: int, edges: tuple[tuple[int, int], ...] = ()) -> Layout:
     """A layout for P points of which nothing is known but how they hang together: p00, p01, ...
 

@@ -12,6 +12,7 @@ from msg_adapters.keypoints import Intrinsics
 from paul_ros.lifter import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS, Lifter
 from paul_ros.model import ModelError, load_model
 from paul_ros.placement import centred_view
+from paul_ros.skeleton import load_layout
 
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)
 
@@ -338,3 +339,20 @@ def test_the_rigid_baseline_is_not_moved(model):
         Lifter(with_misfit(model, size).rigid()).lift(pinhole(truth), everything(truth), CAMERA) for size in (None, 1)
     )
     np.testing.assert_array_equal(a.points, b.points)
+
+
+def test_the_root_is_the_middle_of_the_hips():
+    """In the shipped model's layout pelvis and neck are points of their own, whatever the detector has."""
+    lifter, truth = Lifter(load_model()), persons_at((0.3, 0, 4), (-1, 0, 5), (1, 0, 5))
+    own, point = lifter.model.layout, lifter.model.layout.names.index
+    xy, confidence, visible = load_layout("coco17").map_to(own)(pinhole(truth), np.ones((3, 17)), everything(truth))
+    visible[1, [point("left_hip"), point("pelvis")]] = False
+    visible[2, point("left_hip")] = False  # and its pelvis seen, which tells more than that hip
+    for camera in (CAMERA, None):
+        lifted = lifter.lift(xy, visible, camera)
+        for middle, sides in (("pelvis", ["left_hip", "right_hip"]), ("neck", ["left_shoulder", "right_shoulder"])):
+            off = lifted.points[:, point(middle)] - lifted.points[:, [point(side) for side in sides]].mean(1)
+            np.testing.assert_allclose(off[:2], 0, atol=1e-12)
+        np.testing.assert_array_equal(lifted.root, lifted.points[:, point("pelvis")])
+        hips = lifted.points[2, [point("left_hip"), point("right_hip")]].mean(0)
+        assert np.linalg.norm(lifted.root[2] - hips) > 1e-3

@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paul_ros.skeleton import Handedness, Layout, LayoutError, anonymous_layout, layout_names, load_layout
+from paul_ros.skeleton import Handedness, Layout, LayoutError, anonymous_layout, layout_names, load_layout, middles
 
 POINTS = {
     "body25": 25,
@@ -368,3 +369,15 @@ def test_categories_round_trip_and_hold_every_point_once():
     for wrong in ({"x": list("abc")}, {"x": list("abcd"), "y": list("def")}, {"x": ["z"]}, ["x"], {"x": []}):
         with pytest.raises(LayoutError):
             Layout.from_dict({**data, "categories": wrong})
+
+
+def test_middles_of_other_points():
+    human = load_layout("human")
+    place = {name: index for index, name in enumerate(human.names)}
+    assert middles(human) == {
+        place[middle]: (place[f"left_{part}"], place[f"right_{part}"])
+        for middle, part in (("pelvis", "hip"), ("neck", "shoulder"))
+    }
+    assert middles(load_layout("coco17")) == {}
+    animal = Layout.from_dict({"name": "dog", "names": ["left_shoulder", "neck", "right_shoulder"], "root": "neck"})
+    assert middles(animal) == middles(replace(animal, name="human")) == {}
