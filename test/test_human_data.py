@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_distributed import TORCHRUN
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.model import load_model
@@ -525,6 +526,10 @@ def test_views_of_a_format_are_known(joints):
     assert human_data.FORMAT == 1 and told == pytest.approx((281, 0.40578, 0.089666, 0.069461), rel=1e-3)
 
 
+SETTINGS = ("views.views=1", "steps=2", "batch=16", "start=random", "regression_steps=0", "hold=0", "width=16")
+SMALL = ["--recipe", "human", *(word for setting in SETTINGS for word in ("--set", setting))]
+
+
 def arguments_of_train(*words):
     parser = argparse.ArgumentParser()
     cli.add_arguments(parser)
@@ -543,8 +548,7 @@ def test_nothing_is_written_into_the_folder_that_is_read(archive, option):
 
 def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, capsys):
     """And the same command goes on with the views that it made."""
-    settings = ("views.views=1", "steps=2", "batch=16", "start=random", "regression_steps=0", "hold=0", "width=16")
-    small = [*(word for setting in settings for word in ("--set", setting)), "--quiet", "--recipe", "human"]
+    small = [*SMALL, "--quiet"]
     monkeypatch.setattr(sys, "argv", ["paul", "train"])
     args = arguments_of_train(archive, "-o", tmp_path / "human.npz", *small)
     assert cli.run(args) == 0
@@ -556,3 +560,24 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
     assert cli.run(args) == 0 and views.stat().st_mtime_ns == made
     with pytest.raises(RecipeError, match="--recipe human"):
         cli.run(arguments_of_train(archive, "-o", tmp_path / "x.npz", "--quiet"))
+
+
+def train_together(*words):
+    """``torchrun -m paul_ros.cli train`` with two processes."""
+    command = [sys.executable, *TORCHRUN, "-m", "paul_ros.cli", "train", *map(str, words), *SMALL]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, cwd=ROOT)
+
+
+def test_one_of_two_processes_makes_the_views(archive, tmp_path):
+    """It shows its work; the other waits for the file."""
+    done = train_together(archive, "-o", tmp_path / "human.npz", "--fresh")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("motion capture: 100%") == 1 and done.stdout.count("human.npz") == 1
+
+
+def test_what_one_process_cannot_read_stops_both_with_the_same_words(archive, tmp_path):
+    (archive / "91_01.bvh").write_text("HIERARCHY")
+    wrong = train_together(archive, "-o", tmp_path / "human.npz")
+    told = [line for line in wrong.stderr.splitlines() if "91_01.bvh" in line]
+    assert wrong.returncode == 1 and len(set(told)) == 1 and "broadcast" not in wrong.stderr, wrong.stderr

@@ -24,7 +24,7 @@ from paul_ros.parameters import DEFAULTS
 from paul_ros.skeleton import LayoutError, load_layout
 from training.categories import load_files
 from training.data import DataError, TrainingData, check_sizes
-from training.distributed import is_first, joined
+from training.distributed import from_first, is_first, joined
 from training.encoder_fit import fit_encoder
 from training.export import architecture, export_model
 from training.human_data import check_outside, make_file, motion_files, views_of
@@ -35,6 +35,7 @@ from training.starting import START, Progress
 from training.tensorboard import FOLDER as BOARD
 from training.tensorboard import Board, need_tensorboard
 from training.trainer import CHECKPOINT, LOG, Trainer, TrainingError
+from training.view_settings import Views
 
 VIEWS = "views.npz"
 """What the run's folder keeps of a folder of motion capture."""
@@ -129,12 +130,12 @@ def run(args: argparse.Namespace) -> int:
         raise TrainingError(f"--threads must be at least 1, it is {args.threads}")
     recipe = Recipe.load(args.recipe, args.set)
     folders = _run_folders(args, recipe)
-    data, recipe = _load(args, recipe)
-    data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe)))
-    _check(args, recipe, data)
     torch.set_num_threads(args.threads)
     device = _device(args.device)
     with joined(device):
+        data, recipe = _load(args, recipe, device)
+        data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe)))
+        _check(args, recipe, data)
         if args.fresh and is_first():
             _forget(folders)
         _introduce(data, args)
@@ -152,18 +153,28 @@ def _unused(data: TrainingData, recipe: Recipe) -> tuple[str, ...]:
     )
 
 
-def _load(args: argparse.Namespace, recipe: Recipe) -> tuple[TrainingData, Recipe]:
+def _load(args: argparse.Namespace, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
     """The data, and the recipe, which keeps its views only where they are taken: of a folder of motion capture."""
     layout, paths = args.layout, args.data
     if not (capture := _motion_capture(args)):
         recipe = replace(recipe, views=None)
     else:
-        views = _folder(args) / VIEWS
-        if args.fresh:
-            views.unlink(missing_ok=True)
-        make_file(capture, views_of(recipe), views, quiet=args.quiet)
-        layout, paths = layout or "human", [views]
+        views, path = views_of(recipe), _folder(args) / VIEWS
+        if wrong := from_first(lambda: _make_views(capture, views, path, args), device):
+            raise MocapError(wrong.decode())
+        layout, paths = layout or "human", [path]
     return load_files(paths, load_layout(layout) if layout else None, args.topic, args.min_confidence), recipe
+
+
+def _make_views(capture: Path, views: Views, path: Path, args: argparse.Namespace) -> bytes | None:
+    """What went wrong, for all processes: one that raised here would leave the others waiting."""
+    try:
+        if args.fresh:
+            path.unlink(missing_ok=True)
+        make_file(capture, views, path, quiet=args.quiet)
+    except (MocapError, OSError) as error:
+        return str(error).encode()
+    return None
 
 
 def _motion_capture(args: argparse.Namespace) -> Path | None:
