@@ -15,13 +15,30 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter. `limits`: inclusive (low, high) of a number; `live`: may change while the node runs."""
+    """One parameter. `limits`: inclusive (low, high) of a number; `live`: may change while the node runs.
+
+    `least`: of a number that 0 turns off, the lowest other that makes sense.
+    """
 
     name: str
     default: str | int | float | bool
     description: str
     limits: tuple | None = None
     live: bool = False
+    least: float | None = None
+
+    @property
+    def range(self) -> str:
+        """In words, of one with limits."""
+        low, high = self.limits
+        return f"{low} to {high}" if self.least is None else f"{low:g} or {self.least} to {high}"
+
+    def allows(self, value) -> bool:
+        """Whether it can have a value of its type."""
+        if self.limits is None:
+            return True
+        low, high = self.limits
+        return low <= value <= high and (self.least is None or value == low or value >= self.least)
 
 
 PARAMETERS = (
@@ -63,6 +80,7 @@ PARAMETERS = (
         "Metres, the height of the people in view where it is known, as of children; 0 = the model's adults.",
         (0.0, 3.0),
         live=True,
+        least=0.3,
     ),
     Parameter(
         "smoothing",
@@ -93,9 +111,9 @@ DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 def checked(values: dict) -> dict:
     """Values by name, the defaults of the others added; raises ParameterError for a number out of its limits."""
     for parameter in PARAMETERS:
-        value, (low, high) = values.get(parameter.name, parameter.default), parameter.limits or (None, None)
-        if parameter.limits and not low <= value <= high:
-            raise ParameterError(f"{parameter.name} is {value}; it must lie from {low} to {high}")
+        value = values.get(parameter.name, parameter.default)
+        if not parameter.allows(value):
+            raise ParameterError(f"{parameter.name} is {value}; it must be {parameter.range}")
     return {**DEFAULTS, **values}
 
 
@@ -129,7 +147,7 @@ def _kind(parameter: Parameter) -> str:
     when = "at any time" if parameter.live else "at start"
     if parameter.limits is None:
         return when
-    return f"{when}, {parameter.limits[0]} to {parameter.limits[1]}"
+    return f"{when}, {parameter.range}"
 
 
 if __name__ == "__main__":

@@ -223,11 +223,12 @@ class LiftStream:
 
     @property
     def person_height(self) -> float:
-        """The lifter's; raises ModelError where it is set and the model cannot have it."""
+        """The lifter's. Setting raises ParameterError for a height of nobody, ModelError where the model has none."""
         return self.lifter.person_height
 
     @person_height.setter
     def person_height(self, height: float) -> None:
+        checked({"person_height": height})
         self.lifter.person_height = height
 
     @property

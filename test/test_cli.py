@@ -148,7 +148,8 @@ def test_half_a_bag(model_file, tmp_path):
     [
         (["replay", "nowhere.mcap"], "nowhere.mcap: no such bag"),
         (["replay", ONE, "--model", "nobody"], "no model 'nobody'"),
-        (["replay", ONE, "--person-height", "9"], "person_height is 9.0; it must lie from 0.0 to 3.0"),
+        (["replay", ONE, "--person-height", "9"], "person_height is 9.0; it must be 0 or 0.3 to 3.0"),
+        (["replay", ONE, "--person-height", "1e-9"], "person_height is 1e-09; it must be 0 or 0.3 to 3.0"),
         (["replay", ONE, "--smoothing", "nan"], "smoothing is nan"),
         (["replay", ONE, "--output-layout", "body25"], "has no left_big_toe"),
         (["replay", ONE, "--layout", "coco71"], "did you mean 'coco17'?"),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import logging
 from dataclasses import replace
 
@@ -380,8 +381,15 @@ def test_a_height_that_the_model_cannot_have_is_refused(model_file):
 
 
 def test_parameters_out_of_their_limits_are_refused(model_file):
-    with pytest.raises(ParameterError, match="person_height is -1.0.*0.0 to 3.0"):
+    with pytest.raises(ParameterError, match="person_height is -1.0.*0 or 0.3 to 3.0"):
         open_stream(str(model_file), person_height=-1.0)
+
+
+@pytest.mark.parametrize("height, taken", [(0.0, True), (0.3, True), (3.0, True), (1e-9, False), (0.29, False)])
+def test_the_height_of_nobody_is_refused_at_any_time(stream, height, taken):
+    with contextlib.nullcontext() if taken else pytest.raises(ParameterError, match="0 or 0.3 to 3.0"):
+        stream.person_height = height
+    assert stream.person_height == (height if taken else 0.0)
 
 
 def test_ambiguity_and_distance_sigma_stand_beside_every_point(stream, make):
