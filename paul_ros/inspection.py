@@ -6,18 +6,22 @@ from __future__ import annotations
 from pathlib import Path
 
 from paul_ros.bag import BagError, read_records
-from paul_ros.model import load_model
+from paul_ros.model import load_model, model_names
 from paul_ros.skeleton import Layout, layout_names, load_layout
 
 
 def inspect(thing: str) -> tuple[dict, BagError | None]:
     """The summary of a model, bag or layout, given by name or path; with a damaged bag also what is wrong with it.
 
+    Of a shipped model whose name a layout has too, as `human`, the layout's stands in the model's.
     Raises BagError, LayoutError or ModelError.
     """
     path = Path(thing)
     if path.is_dir() or path.suffix in (".mcap", ".part"):
         return _bag(path)
+    if thing in model_names():
+        same_name = {"layout_of_this_name": _layout(load_layout(thing))} if thing in layout_names() else {}
+        return {**_model(thing), **same_name}, None
     if thing in layout_names() or path.suffix in (".yaml", ".yml"):
         return _layout(load_layout(thing)), None
     return _model(thing), None
