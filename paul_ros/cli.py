@@ -41,7 +41,7 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
         help="lift a recorded bag in code and judge it",
         description="Lift every 2D keypoint message of a bag, deterministically, through the code of the node. "
         "Prints a table of errors where the bag has a ground truth. A damaged bag is lifted up to the damage; the exit "
-        "code is then 1.",
+        "code is then 1, as where nobody could be lifted.",
     )
     parser.add_argument("bag", metavar="BAG", type=Path, help=".mcap file or rosbag2 folder")
     parser.add_argument(
@@ -114,8 +114,8 @@ def _replay(args: argparse.Namespace) -> None:
             write_picture(args.plot, done)
     finally:
         print(table(report))  # after the files, for who reads it may stop reading
-    if not done.frames:
-        raise BagError(f"{args.bag}: no keypoint message could be used: {'; '.join(done.stream.explanations.values())}")
+    if not report["lifted"] and done.why_not:
+        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.why_not)}")
     if done.damage:
         raise done.damage
 

@@ -119,6 +119,11 @@ class Replay:
         """Of frames and truth."""
         return self.stream.route.output
 
+    @property
+    def why_not(self) -> list[str]:
+        """What to do about messages that were dropped and persons that were left out; each reason once."""
+        return [text for reason, text in self.stream.explanations.items() if self.stream.drops[reason]]
+
 
 def replay(
     bag: Path,

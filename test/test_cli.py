@@ -9,9 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from conftest import header_of, persons_at, seen
 
+from msg_adapters.outputs import keypoints_cloud
 from paul_ros import __version__, cli
+from paul_ros.bag import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
 ONE = ROOT / "bags" / "one_person.mcap"
@@ -131,6 +135,29 @@ def test_replay(model_file, tmp_path):
     assert json.loads(files[1].read_text())["frames"] == 585
 
 
+@pytest.mark.parametrize(
+    "layout, shown, clue",
+    [
+        ("human", 17, "set the parameter `layout` to the one your detector uses: coco17, h36m17"),
+        ("coco17", 3, "too few of its keypoints are visible"),
+        ("coco17", 17, ""),
+    ],
+)
+def test_nobody_lifted_is_no_success(layout, shown, clue, model_file, tmp_path, capsys, bag_make):
+    """Whether messages could not be used or persons could not be lifted, and although there are frames of nobody."""
+    with BagWriter(tmp_path / "x.mcap") as writer:
+        for second, persons in enumerate((0, 1)):
+            xy = seen(persons_at(*[(0, 0, 4)] * persons))
+            xy[:, shown:] = np.nan
+            message = keypoints_cloud(bag_make, header_of(bag_make, second), xy, np.ones(xy.shape[:2]), ["1"] * persons)
+            writer.write("/keypoints", message, second * 10**9)
+    words = ["replay", tmp_path / "x.mcap", "--layout", layout, "--json", tmp_path / "r.json"]
+    assert cli.main([str(word) for word in words]) == (1 if clue else 0)
+    error = capsys.readouterr().err
+    assert clue in error and error.count("\n") == (1 if clue else 0)
+    assert json.loads((tmp_path / "r.json").read_text())["lifted"] == (0 if clue else 1)
+
+
 def test_half_a_bag(model_file, tmp_path):
     """All that could be read is lifted and reported, and yet it is no success."""
     half = tmp_path / "half.mcap"
@@ -196,6 +223,16 @@ def test_inspect(thing, expected, model_file, tmp_path, capsys):
             "messages": 585,
             "rate_hz": pytest.approx(30, abs=0.06),
         }
+
+
+def test_inspect_what_is_a_model_and_a_layout(tmp_path, capsys):
+    """The model is what is meant; the layout is told too."""
+    assert cli.main(["inspect", "human", "--json", str(tmp_path / "r.json")]) == 0
+    summary = json.loads((tmp_path / "r.json").read_text())
+    assert summary["kind"] == "model" and summary["sha256"] and summary["layout"] == "human"
+    assert summary["layout_of_this_name"]["kind"] == "layout" and summary["layout_of_this_name"]["points"] == 43
+    printed = capsys.readouterr().out
+    assert printed.startswith("kind ") and "model" in printed.splitlines()[0] and "nose, left_eye" in printed
 
 
 def test_inspect_a_damaged_bag(tmp_path, capsys):
