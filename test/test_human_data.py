@@ -20,7 +20,7 @@ from paul_ros.placement import centred_view
 from paul_ros.skeleton import LayoutError, load_layout
 from training import cli, human_data
 from training.cameras import hidden_by_body, random_cameras
-from training.data import load_training_data
+from training.data import DataError, load_training_data
 from training.detector import detect, redefined, reported
 from training.human_data import other_people, see
 from training.mocap import CMU31, PARENTS, MocapError, human_layout, human_mapping, human_points, layout_points
@@ -461,8 +461,9 @@ def test_the_command_says_what_is_wrong(archive, tmp_path):
         ((archive, "--set", "bottleneck.a=1"), "bottleneck has no settings of its own"),
         ((archive, "--recipe", "default"), "--recipe human"),
         ((tmp_path / "empty",), "holds no motion capture"),
+        ((archive, "--set", "views.hidden=[1,1]"), "enough points to be lifted: lower views.hidden, which is [1"),
     ):
-        wrong = command(*arguments, "-o", tmp_path / "2d.npz")
+        wrong = command(*arguments, "-o", tmp_path / "2d.npz", "--quiet")
         assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and told in wrong.stderr, wrong.stderr
 
 
@@ -560,6 +561,20 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
     assert cli.run(args) == 0 and views.stat().st_mtime_ns == made
     with pytest.raises(RecipeError, match="--recipe human"):
         cli.run(arguments_of_train(archive, "-o", tmp_path / "x.npz", "--quiet"))
+
+
+@pytest.mark.parametrize(
+    "words, error, told",
+    [
+        (("--layout", "coco17"), DataError, "43 points of layout human, not the 17 of coco17: leave out --layout"),
+        (("--set", "known_lengths=[[left_hip, tail, 0.4]]"), RecipeError, "tail"),
+        (("--set", "hold=0", "--set", "steps=0", "--set", "regression_steps=0"), RecipeError, "no networks"),
+    ],
+)
+def test_what_can_be_told_is_told_before_views_are_made(archive, tmp_path, monkeypatch, words, error, told):
+    monkeypatch.setattr(cli, "make_file", lambda *given, **named: pytest.fail("views were made"))
+    with pytest.raises(error, match=told):
+        cli.run(arguments_of_train(archive, "-o", tmp_path / "human.npz", "--recipe", "human", *words))
 
 
 def train_together(*words):

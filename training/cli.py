@@ -21,14 +21,14 @@ from paul_ros.bag import BagError, check_outputs
 from paul_ros.files import write_atomically
 from paul_ros.model import ModelError, check_size
 from paul_ros.parameters import DEFAULTS
-from paul_ros.skeleton import LayoutError, load_layout
+from paul_ros.skeleton import Layout, LayoutError, load_layout
 from training.categories import load_files
 from training.data import DataError, TrainingData, check_sizes
 from training.distributed import from_first, is_first, joined
 from training.encoder_fit import fit_encoder
 from training.export import architecture, export_model
 from training.human_data import check_outside, make_file, motion_files, views_of
-from training.mocap import MocapError
+from training.mocap import MocapError, human_layout
 from training.recipe import Recipe, RecipeError, recipe_names
 from training.reconstruction import Run, reconstruction_of, restarts, run_folder, train_restarts
 from training.starting import START, Progress
@@ -135,7 +135,6 @@ def run(args: argparse.Namespace) -> int:
     with joined(device):
         data, recipe = _load(args, recipe, device)
         data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe)))
-        _check(args, recipe, data)
         if args.fresh and is_first():
             _forget(folders)
         _introduce(data, args)
@@ -155,15 +154,29 @@ def _unused(data: TrainingData, recipe: Recipe) -> tuple[str, ...]:
 
 def _load(args: argparse.Namespace, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
     """The data, and the recipe, which keeps its views only where they are taken: of a folder of motion capture."""
-    layout, paths = args.layout, args.data
-    if not (capture := _motion_capture(args)):
-        recipe = replace(recipe, views=None)
-    else:
-        views, path = views_of(recipe), _folder(args) / VIEWS
-        if wrong := from_first(lambda: _make_views(capture, views, path, args), device):
-            raise MocapError(wrong.decode())
-        layout, paths = layout or "human", [path]
-    return load_files(paths, load_layout(layout) if layout else None, args.topic, args.min_confidence), recipe
+    layout = load_layout(args.layout) if args.layout else None
+    if capture := _motion_capture(args):
+        return _load_people(capture, args, recipe, layout or human_layout(), device), recipe
+    data = load_files(args.data, layout, args.topic, args.min_confidence)
+    _check(args, recipe, data.layout)
+    return data, replace(recipe, views=None)
+
+
+def _load_people(
+    capture: Path, args: argparse.Namespace, recipe: Recipe, layout: Layout, device: torch.device
+) -> TrainingData:
+    """Views of motion capture; they take minutes, so all that can be told before is."""
+    views, path = views_of(recipe), _folder(args) / VIEWS
+    given, named = len(human_layout().names), len(layout.names)
+    if given != named:
+        raise DataError(
+            f"motion capture gives the {given} points of layout {human_layout().name}, not the {named} of "
+            f"{layout.name}: leave out --layout {args.layout}"
+        )
+    _check(args, recipe, layout)
+    if wrong := from_first(lambda: _make_views(capture, views, path, args), device):
+        raise MocapError(wrong.decode())
+    return load_files([path], layout)
 
 
 def _make_views(capture: Path, views: Views, path: Path, args: argparse.Namespace) -> bytes | None:
@@ -203,10 +216,10 @@ def _run_folders(args: argparse.Namespace, recipe: Recipe) -> list[Path]:
     return folders
 
 
-def _check(args: argparse.Namespace, recipe: Recipe, data: TrainingData) -> None:
+def _check(args: argparse.Namespace, recipe: Recipe, layout: Layout) -> None:
     """What can be told before the first step."""
     try:
-        recipe.check_points(data.layout)
+        recipe.check_points(layout)
     except RecipeError as error:
         if recipe.known_lengths != Recipe.load(args.recipe).known_lengths:
             raise
@@ -214,7 +227,7 @@ def _check(args: argparse.Namespace, recipe: Recipe, data: TrainingData) -> None
     if args.output and not recipe.steps and not recipe.regression_steps:
         raise RecipeError("no networks are trained with steps: 0, so there is no model: ask for --shapes instead of -o")
     if args.output:
-        check_size(architecture(recipe), len(data.layout.names))
+        check_size(architecture(recipe), len(layout.names))
     if args.tensorboard:
         need_tensorboard()
 

@@ -304,6 +304,9 @@ def make(
 
     The trainer is given all points as they truly are in the image, W, and as the detector reports them, ``detected``;
     what is judged is the detector's report alone.  Frames with too few visible points to be lifted are left out.
+
+    Raises:
+        MocapError: all of them are.
     """
     rng = np.random.default_rng(views.seed)
     joints = np.concatenate([joints[distinct_frames(joints, views.motion)] for _, joints in clips])
@@ -314,6 +317,11 @@ def make(
         parts.append(tuple(array[enough] for array in (seen.W, seen.visible, seen.marked, seen.S)))
         progress(min(1.0, (number + 1) * _BLOCK / drawn))
     W, visible, marked, S = (np.concatenate(arrays) for arrays in zip(*parts))
+    if not len(W):
+        raise MocapError(
+            f"none of the {drawn} views shows enough points to be lifted: lower views.hidden, which is "
+            f"{list(views.hidden)}, views.obstacle, {views.obstacle}, or views.min_confidence, {views.min_confidence}"
+        )
     about = {
         "source": "CMU motion capture (mocap.cs.cmu.edu)",
         "layout": human_layout().name,
@@ -343,7 +351,7 @@ def make_file(folder: Path, views: Views, path: Path, truth: Path | None = None,
     A file that was made by this format, from files of the same names and contents with the same settings, is left.
 
     Raises:
-        MocapError: the folder holds none, or a file of it cannot be used.
+        MocapError: the folder holds none, a file of it cannot be used, or the views show nothing.
     """
     made = {"format": FORMAT, "files": _digest(folder), "views": views.to_dict()}
     if truth is None and _made_of(path) == made:
