@@ -58,13 +58,15 @@ class Lifted:
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
         reprojection: (N,) pixels, root mean square over the points used.
+        unexplained: (N,) reprojection over the rms extent of the points used: 0 where the shape is that of the image,
+            near 1 where it has nothing of it, as where the points are in another order than the layout's.
         ambiguity: (N,) 0..1, residual of the pose over that of its depth-reversed rival, the second optimum of
             orthographic-N-point; 0 where there is none, 1 where the image cannot tell them apart.
         certified: (N,) the pose, or what a pinhole camera's was refined from, is the proven optimum of
             orthographic-N-point.
         distance_sigma: (N,) metres, standard deviation of the root's distance: that of people's heights, unless the
-            height is known, and of the fit, the reprojection over the rms extent of the points used, which the
-            distances of the bags' persons are found to be wrong by. NaN in model units.
+            height is known, and of the fit, ``unexplained``, which the distances of the bags' persons are found to be
+            wrong by. NaN in model units.
         used: (N,P) bool, the points it was lifted from: visible, within 60 degrees of the person, and not so far from
             where the lifted shape has them that a detector must have been wrong.
         reason: N slugs, '' where lifted, else why not: ``too_few_points``, fewer visible than the model asks for;
@@ -80,6 +82,7 @@ class Lifted:
     rotation: np.ndarray
     scale: np.ndarray
     reprojection: np.ndarray
+    unexplained: np.ndarray
     ambiguity: np.ndarray
     certified: np.ndarray
     distance_sigma: np.ndarray
@@ -183,15 +186,17 @@ class Lifter:
         enough = enough_visible(visible, self.model.layout)
         fixed = fit.fixed & ~_on_a_line(W, fit.used) & (camera is None or fit.extent * pixels >= MIN_EXTENT)
         root = points[:, root].mean(1)
+        unexplained = fit.residual / np.maximum(fit.extent, 1e-12)
         lifted = Lifted(
             points=points,
             root=root,
             rotation=fit.R if turn is None else turn @ fit.R,
             scale=pixels / fit.T[:, 2],
             reprojection=pixels * fit.residual,
+            unexplained=unexplained,
             ambiguity=fit.ambiguity,
             certified=fit.certified,
-            distance_sigma=self._sigma(root, fit, units),
+            distance_sigma=self._sigma(root, unexplained, units),
             used=fit.used,
             reason=("",) * len(xy),
             units=units,
@@ -230,11 +235,10 @@ class Lifter:
             known = ~used[:, point] | used[:, parts].all(1)
             shape[known, :, point] = shape[known][:, :, parts].mean(2)
 
-    def _sigma(self, root: np.ndarray, fit: _Fit, units: str) -> np.ndarray:
+    def _sigma(self, root: np.ndarray, unexplained: np.ndarray, units: str) -> np.ndarray:
         if units != "m":
             return np.full(len(root), np.nan)
-        wrong = fit.residual / np.maximum(fit.extent, 1e-12)
-        return np.sqrt((root * root).sum(1) * (self.size_spread**2 + wrong * wrong))
+        return np.sqrt((root * root).sum(1) * (self.size_spread**2 + unexplained * unexplained))
 
     def _fit_sure(self, W: np.ndarray, visible: np.ndarray, pinhole: bool) -> _Fit:
         """Fits, once more without the points that must be misdetections, where enough are left."""
@@ -320,6 +324,7 @@ def _nothing(N: int, P: int, units: str) -> Lifted:
         rotation=np.tile(np.eye(3), (N, 1, 1)),
         scale=np.full(N, np.nan),
         reprojection=np.full(N, np.nan),
+        unexplained=np.full(N, np.nan),
         ambiguity=np.full(N, np.nan),
         certified=np.zeros(N, bool),
         distance_sigma=np.full(N, np.nan),

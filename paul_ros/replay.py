@@ -261,6 +261,8 @@ def _nothing_there(bag: Path, topics: Topics) -> str:
 def evaluate(done: Replay) -> dict:
     """The report of a replay: the fixed keys of `paul replay --json` and some more; None where there is no truth.
 
+    advice: what to do about what was dropped or noted, by the same names.
+
     Shape errors are over all points, hidden ones too, that the ground truth of a lifted person has: of
     persons_with_truth persons the share points_with_truth_share of the P points. NE and the position of the root need
     metric output, so they are None in model units.
@@ -276,6 +278,8 @@ def evaluate(done: Replay) -> dict:
         "persons": stream.counts["persons"],
         "lifted": stream.counts["lifted"],
         "dropped": dict(sorted(stream.drops.items())),
+        "noted": dict(sorted(stream.notes.items())),
+        "advice": dict(sorted(stream.explanations.items())),
         "units": stream.units,
         **errors(with_truth(done, done.frames), done.layout.root),
         "reprojection_median_px": _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),

@@ -47,6 +47,8 @@ def table(report: dict) -> str:
         f"  model {report['model']} ({report['model_sha256'][:12]}), layout {report['layout']}, "
         f"units {report['units']}",
     ]
+    advice = report["advice"]
+    lines += [f"  noted: {count} {what}: {advice[what]}" for what, count in report["noted"].items() if what in advice]
     if report["persons_with_truth"]:
         lines += ["", f"  {_judged(report)}", f"  {'':<22}{'lifted':>9}{'rigid':>9}"]
         lines += [

@@ -97,6 +97,17 @@ def test_too_few_points_are_not_lifted_and_the_others_are(model):
     assert np.isnan(lifted.points[0]).all() and np.isfinite(lifted.points[1]).all()
 
 
+@pytest.mark.parametrize("camera", [CAMERA, None])
+def test_what_is_unexplained_is_a_share_of_the_extent(rigid_lifter, model, camera):
+    """The same at any size in the image: nothing of the model's own shape, nearly all of points in another order."""
+    truth = np.concatenate([standing(model, [0, 0, 4]), standing(model, [0, 0, 8])])
+    order = np.random.default_rng(0).permutation(17)
+    right, wrong = (rigid_lifter.lift(pinhole(some), everything(truth), camera) for some in (truth, truth[:, order]))
+    assert right.unexplained.max() < 0.03 and wrong.unexplained.min() > 0.6
+    extent = np.sqrt(pinhole(truth).var(1).sum(1))
+    np.testing.assert_allclose(wrong.unexplained, wrong.reprojection / extent, rtol=0.03)
+
+
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.6])
 def test_any_subset_of_enough_points_is_lifted_to_finite_points(model, share):
     rng = np.random.default_rng(0)

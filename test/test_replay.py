@@ -254,6 +254,17 @@ def test_without_camera_info(short, model_file, tmp_path):
     assert report["root_error_median_mm"] is None and report["ne_flip_frame_percent"] is None
 
 
+@pytest.mark.parametrize("bag", [ONE, TWO])
+def test_a_wrong_layout_is_told(bag, tmp_path):
+    """COCO's points in the order of Human3.6M: as many, so nothing but the shapes tells; right ones are never noted."""
+    part = part_of(bag, tmp_path / "x.mcap", 4)
+    right, wrong = (evaluate(replay(part, open_stream(None, layout))) for layout in ("coco17", "h36m17"))
+    assert not right["noted"] and "noted" not in table(right)
+    assert wrong["noted"]["unlike_the_model"] > 0.9 * wrong["lifted"] > 50
+    said = next(line for line in table(wrong).splitlines() if "noted" in line)
+    assert "layout 'h36m17'" in said and "set the parameter `layout`" in said
+
+
 def test_no_person_at_all(model_file, tmp_path):
     bag = part_of(TWO, tmp_path / "x.mcap", 0.5)
     report = evaluate(replay(bag, open_stream(model_file)))
