@@ -57,7 +57,9 @@ class Lifted:
             ``points``, but where a pelvis was seen beside a hidden hip.
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit (at the person's distance).
-        reprojection: (N,) pixels, root mean square over the points used.
+        reprojection: (N,) pixels, root mean square over the points used, of the shape as the model has it: before its
+            points were moved to where they are seen (S_cam of the paper's equation 4), after which ``points`` project
+            nearer to their pixels than this says.
         unexplained: (N,) reprojection over the rms extent of the points used: 0 where the shape is that of the image,
             near 1 where it has nothing of it, as where the points are in another order than the layout's.
         ambiguity: (N,) 0..1, residual of the pose over that of its depth-reversed rival, the second optimum of
