@@ -113,7 +113,9 @@ class Lifter:
             )
         self.model = model
         self.person_height = person_height
-        self._middles = middles(model.layout)
+        between = middles(model.layout)
+        # (M,) points and (2,M) the two that each is the middle of.
+        self._middles = np.array(list(between), int), np.array(list(between.values()), int).reshape(-1, 2).T
 
     @property
     def person_height(self) -> float:
@@ -233,9 +235,9 @@ class Lifter:
 
         So the root of a person is in the middle of its hips; a pelvis that was seen beside a hidden hip stays.
         """
-        for point, parts in self._middles.items():
-            known = ~used[:, point] | used[:, parts].all(1)
-            shape[known, :, point] = shape[known][:, :, parts].mean(2)
+        point, parts = self._middles
+        known = ~used[:, point] | used[:, parts].all(1)
+        shape[..., point] = np.where(known[:, None], shape[..., parts].mean(2), shape[..., point])
 
     def _sigma(self, root: np.ndarray, unexplained: np.ndarray, units: str) -> np.ndarray:
         if units != "m":

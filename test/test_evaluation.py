@@ -199,7 +199,7 @@ def test_the_baseline_is_the_rigid_mean_shape(model_file, tmp_path):
     """Of a model that knows one shape only, both are the same."""
     report = evaluate(model_file, write(tmp_path / "d.npz", turned(model_file) * [[1], [1], [1.2]]), tmp_path)
     for key, value in report["baseline"].items():
-        assert report[key] == pytest.approx(value, rel=1e-6)
+        assert report[key] == pytest.approx(value, rel=1e-6, abs=1e-5)  # % and units: the reprojection is next to 0
     assert report["baseline"]["ne_flip_frame_percent"] > 1
 
 

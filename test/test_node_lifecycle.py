@@ -126,7 +126,7 @@ def other_model(model_file, tmp_path):
 
 
 def test_a_model_is_swapped_between_two_frames_and_none_is_lost(managed, other_model, model_file):
-    """100 Hz: every stamp is answered once; persons are 4 m away before the swap, 8 m after."""
+    """Up to 100 Hz: every stamp is answered once; persons are 4 m away before the swap, 8 m after."""
     from conftest import camera_info
 
     bench = managed()
@@ -136,11 +136,13 @@ def test_a_model_is_swapped_between_two_frames_and_none_is_lost(managed, other_m
     bench.lifts()
     missed, first = bench.diagnosed().get("dropped_missed"), bench.stamp + 1
     asked = swapped = None
-    began, sent = time.monotonic(), 0
+    due, sent = time.monotonic(), 0
     while sent < 300:
-        if time.monotonic() >= began + sent / 100:
+        answered = bench.got["poses"][-1].header.stamp.sec
+        # A machine that stands still for long may not lose them by more than the queues hold.
+        if time.monotonic() >= due and bench.stamp - answered < 8:
             bench.send(good())
-            sent += 1
+            due, sent = time.monotonic() + 0.01, sent + 1
         bench.ros.spin_once(bench.node, timeout_sec=0.001)
         if sent == 100 and asked is None:
             asked = bench.stamp
