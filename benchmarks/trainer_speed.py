@@ -47,7 +47,9 @@ def views() -> TrainingData:
     rng, model = np.random.default_rng(0), load_model()
     S = random_rotations(FRAMES, 0) @ model.decode(0.3 * rng.standard_normal((FRAMES, model.header["bottleneck"])))
     visible = np.ones((FRAMES, S.shape[2]), bool)
-    return TrainingData(np.ascontiguousarray(S[:, :2], np.float32), visible, model.layout, False, "made", 0)
+    return TrainingData(
+        np.ascontiguousarray(S[:, :2], np.float32), visible, model.layout, False, "made", np.ones(len(S), bool)
+    )
 
 
 class Twin:

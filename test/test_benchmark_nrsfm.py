@@ -48,7 +48,9 @@ class FakeTrainer:
         S = np.array([self.shapes.get(W.tobytes(), np.ones((3, POINTS))) for W in data.W])
         S = S * [[1.0], [1.0], [1 + self.excess(recipe.seed)]]
         codes = data.W[:, 0, :4].copy()
-        return Reconstruction(S, np.tile(np.eye(3), (len(S), 1, 1)), codes, 10.0 - recipe.seed, 2.0)
+        return Reconstruction(
+            np.ones(len(S), bool), S, np.tile(np.eye(3), (len(S), 1, 1)), codes, 10.0 - recipe.seed, 2.0
+        )
 
 
 @pytest.fixture
@@ -124,7 +126,7 @@ def test_no_ground_truth_reaches_the_trainer(folder, tmp_path, fake):
     """Neither in what it is given nor in any file of its folder; and its data does not change with the truth."""
     paul(folder, tmp_path, "--seeds", "1", "--sequences", "made", "--methods", "paul")
     data, _, run = fake.calls[0]
-    assert {name for name, value in vars(data).items() if isinstance(value, np.ndarray)} == {"W", "visible"}
+    assert {name for name, value in vars(data).items() if isinstance(value, np.ndarray)} == {"W", "visible", "used"}
     assert not data.layout.edges
     with np.load(run.parent / "given.npz") as archive:
         assert set(archive.files) == {"W", "visible"}

@@ -140,7 +140,7 @@ def test_a_wild_point_is_refused_where_all_frames_have_one_scale(tmp_path):
     (note,) = check_sizes(data, "free")
     assert note.startswith("frame 3 of data.npz")
     W[1, :, 1:] = np.nan
-    with pytest.raises(DataError, match="frame 2 of data.npz, counted without those left out, is"):
+    with pytest.raises(DataError, match="frame 3 of data.npz is"):
         check_sizes(load(tmp_path, W=W), "unit")
 
 

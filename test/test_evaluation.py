@@ -339,7 +339,7 @@ def test_mean_shape_of_one_shape_in_many_poses_is_that_shape():
 
 def saved(path, S):
     turn = random_rotations(len(S), 7)
-    Reconstruction(S.astype(np.float32), turn.astype(np.float32), None, 0.5, 12.0).save(path)
+    Reconstruction(np.ones(len(S), bool), S.astype(np.float32), turn.astype(np.float32), None, 0.5, 12.0).save(path)
     return str(path)
 
 
@@ -363,6 +363,17 @@ def test_a_saved_reconstruction_is_judged_frame_by_frame(tmp_path):
     mixed = evaluate_saved(saved(tmp_path / "c.npz", some_mirrored), data, tmp_path)
     assert mixed["flipped_share"] == pytest.approx(1 / 3) and mixed["ne_flip_frame_percent"] < 1e-4
     assert mixed["ne_flip_global_percent"] > 10
+
+
+def test_frames_that_were_left_out_of_a_reconstruction_are_counted(tmp_path):
+    made = sequence()
+    truth, used = made.S - made.S.mean(2, keepdims=True), np.arange(len(made.S)) % 3 > 0
+    path = tmp_path / "s.npz"
+    turn = random_rotations(used.sum(), 7).astype(np.float32)
+    Reconstruction(used, truth[used].astype(np.float32), turn, None, 0.5, 12.0).save(path)
+    report = evaluate_saved(path, write(tmp_path / "d.npz", made.S), tmp_path)
+    assert report["ne_flip_global_percent"] < 1e-4 and report["frames"] == len(used)
+    assert report["dropped"] == {"too_few_points": int((~used).sum())}
 
 
 def test_the_baseline_of_a_reconstruction_is_its_rigid_mean(tmp_path):

@@ -163,9 +163,11 @@ def test_a_saved_reconstruction_is_read_again(tmp_path):
 NO_RECONSTRUCTION = {
     "nothing": (None, "is not there"),
     "data": (dict(W=np.zeros((4, 2, 5))), "has no array shapes; it has .*W"),
-    "much else": ({f"a{i}": 0 for i in range(9)}, "it has rotations, loss, seconds, a0, a1 and 7 more"),
+    "much else": ({f"a{i}": 0 for i in range(9)}, "it has rotations, used, loss, seconds, a0 and 8 more"),
     "2D": (dict(shapes=np.zeros((4, 2, 5))), r"not \(F,3,P\)"),
     "pickled": (dict(shapes=np.array([{}])), "plain arrays with np.savez"),
+    "frames of others": (dict(shapes=np.zeros((4, 3, 5)), used=np.arange(6) < 3), "which frames its 4 are"),
+    "frames by number": (dict(shapes=np.zeros((4, 3, 5)), used=np.arange(4)), "which frames its 4 are"),
     "a loss in words": (dict(shapes=np.zeros((4, 3, 5)), loss="low"), "no numbers"),
 }
 
@@ -175,7 +177,10 @@ def test_what_is_no_reconstruction_is_refused(tmp_path, case):
     contents, message = NO_RECONSTRUCTION[case]
     path = tmp_path / "x.npz"
     if contents:
-        np.savez(path, **{"rotations": np.zeros((4, 3, 3)), "loss": 0.0, "seconds": 0.0, **contents})
+        np.savez(
+            path,
+            **{"rotations": np.zeros((4, 3, 3)), "used": np.ones(4, bool), "loss": 0.0, "seconds": 0.0, **contents},
+        )
     with pytest.raises(DataError, match=f"no saved reconstruction: .*{message}") as caught:
         load_reconstruction(path)
     assert "allow_pickle" not in str(caught.value)

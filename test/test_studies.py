@@ -36,7 +36,9 @@ class FakeTrainer:
         self.calls.append((data, recipe))
         S = np.concatenate([data.W, np.zeros_like(data.W[:, :1])], axis=1)
         codes = data.W[:, 0, : recipe.bottleneck].copy()
-        return Reconstruction(S, np.tile(np.eye(3), (len(S), 1, 1)), codes, float(recipe.seed), 1.0)
+        return Reconstruction(
+            np.ones(len(S), bool), S, np.tile(np.eye(3), (len(S), 1, 1)), codes, float(recipe.seed), 1.0
+        )
 
 
 @pytest.fixture

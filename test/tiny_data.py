@@ -25,7 +25,7 @@ def sequence(frames=40, seed=0, hidden=0.0, bend=0.2, layout=None):
     camera = 50 * R @ S
     visible = rng.random((frames, points)) >= hidden
     W = np.where(visible[:, None], camera[:, :2] + 200, 0).astype(np.float32)
-    data = TrainingData(W, visible, layout or anonymous_layout(points), False, "made up", 0)
+    data = TrainingData(W, visible, layout or anonymous_layout(points), False, "made up", np.ones(frames, bool))
     return data, camera.astype(np.float32), R.astype(np.float32)
 
 

@@ -126,6 +126,6 @@ def _joined(parts: list[TrainingData], W: np.ndarray, visible: np.ndarray, layou
         layout,
         parts[0].calibrated,
         source=", ".join(part.source for part in parts),
-        left_out=sum(part.left_out for part in parts),
+        used=np.concatenate([part.used for part in parts]),
         notes=tuple(f"{part.source}: {note}" for part in parts for note in part.notes),
     )

@@ -61,7 +61,7 @@ class TrainingData:
         layout: the keypoints.
         calibrated: W are rays, (x/z, y/z) of a pinhole camera turned to the object; else pixels or any unit.
         source: file name, for provenance.
-        left_out: frames that held fewer visible points than can be lifted.
+        used: (G,) bool, of the frames as given those that are these F: which show enough points to be lifted.
         notes: what is odd about the data and does not forbid training, a sentence each.
         detected: (F,2,P) float32, or None: the same points as a detector would give them, NaN where it would not. Where
             solutions are held, h is taught to read such views; everything is explained from W.
@@ -72,9 +72,14 @@ class TrainingData:
     layout: Layout
     calibrated: bool
     source: str
-    left_out: int
+    used: np.ndarray
     notes: tuple[str, ...] = ()
     detected: np.ndarray | None = None
+
+    @property
+    def left_out(self) -> int:
+        """Frames that showed too few points to be lifted, or had them all on one line."""
+        return int((~self.used).sum())
 
     @cached_property
     def image_unit(self) -> float:
@@ -121,8 +126,8 @@ def _wild(data: TrainingData, frame: int, ratio: float) -> str:
     seen = data.visible[frame]
     offset = data.W[frame] - np.median(data.W[frame][:, seen], axis=1, keepdims=True)
     point = data.layout.names[int(np.where(seen, np.linalg.norm(offset, axis=0), -1.0).argmax())]
-    counted = ", counted without those left out," if data.left_out else ""
-    return f"frame {frame} of {data.source}{counted} is {ratio:.0f} times as large as the median one, by point {point}"
+    number = np.flatnonzero(data.used)[frame]
+    return f"frame {number} of {data.source} is {ratio:.0f} times as large as the median one, by point {point}"
 
 
 def load_training_data(
@@ -325,9 +330,7 @@ def _checked(
         detected = detected if detected is None else detected[enough]
     _check_motion(W, visible, path)
     _check_twins(W, visible, layout, path)
-    return TrainingData(
-        W, visible, layout, calibrated, path.name, int((~enough).sum()), _notes(visible, layout, guessed), detected
-    )
+    return TrainingData(W, visible, layout, calibrated, path.name, enough, _notes(visible, layout, guessed), detected)
 
 
 def _check_motion(W: np.ndarray, visible: np.ndarray, path: Path) -> None:

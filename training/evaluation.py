@@ -146,23 +146,23 @@ def evaluate_shapes(shapes: str | Path, truth_file: str | Path) -> tuple[dict, C
         found = load_reconstruction(shapes)
     except DataError as error:
         raise DataError(f"{error}; a model is judged without --truth: MODEL DATA") from error
-    if found.shapes.shape != truth.S.shape:
+    given = (len(found.used), *found.shapes.shape[1:])
+    if given != truth.S.shape:
         raise DataError(
-            f"'{shapes}' holds shapes {found.shapes.shape}, the truth in '{truth_file}' is {truth.S.shape}: "
+            f"'{shapes}' holds shapes of frames and points {given}, the truth in '{truth_file}' is {truth.S.shape}: "
             "name the file that was reconstructed"
         )
+    S = np.zeros(given, np.float32)
+    S[found.used] = found.shapes
+    dropped = np.where(found.used, "", TOO_FEW_POINTS).astype(object)
     mean = rigid_mean(found.shapes, found.rotations)
-    compared = Comparison.of(truth, Prediction(found.shapes, _none_dropped(truth)), _rigid(mean, truth), flip=True)
+    compared = Comparison.of(truth, Prediction(S, dropped), _rigid(mean, truth), flip=True)
     return _report(compared, shapes=Path(shapes).name, loss=found.loss, seconds=found.seconds), compared
-
-
-def _none_dropped(truth: Sequence) -> np.ndarray:
-    return np.full(len(truth.W), "", object)
 
 
 def _rigid(mean: np.ndarray, truth: Sequence) -> Prediction:
     """The mean shape (3,P) put before every camera, with its best scale."""
-    S, dropped = np.zeros(truth.S.shape, np.float32), _none_dropped(truth)
+    S, dropped = np.zeros(truth.S.shape, np.float32), np.full(len(truth.W), "", object)
     for rows in _blocks(np.arange(len(S))):
         pose = onp(np.broadcast_to(mean, (len(rows), *mean.shape)), truth.W[rows], truth.visible[rows])
         S[rows] = pose.scale[:, None, None] * centred(pose.R @ mean, truth.visible[rows])

@@ -32,6 +32,8 @@ class Reconstruction:
     """3D shapes of all training frames, in their cameras' frames.
 
     Attributes:
+        used: (G,) bool, of the frames as they were given those that these F are, in their order; the others showed too
+            few points.
         shapes: (F,3,P) float32, image units, centred on the visible points: x and y of visible points as observed, all
             else the mean of the streams (S_cam of the paper and of its supplement, equation 14).
         rotations: (F,3,3) float32, from the canonical to the camera frame.
@@ -41,6 +43,7 @@ class Reconstruction:
         seconds: of training, all restarts and the search for starts.
     """
 
+    used: np.ndarray
     shapes: np.ndarray
     rotations: np.ndarray
     codes: np.ndarray | None
@@ -62,17 +65,19 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
         DataError: there is no such file, or it holds something else.
     """
     try:
-        arrays = read_npz(path, ("shapes", "rotations", "loss", "seconds"), ("codes",))
+        arrays = read_npz(path, ("shapes", "rotations", "used", "loss", "seconds"), ("codes",))
     except NpzError as error:
         raise DataError(f"'{path}' is no saved reconstruction: it {error}") from error
-    shapes, rotations = arrays["shapes"], arrays["rotations"]
+    used, shapes, rotations = arrays["used"], arrays["shapes"], arrays["rotations"]
     if shapes.ndim != 3 or shapes.shape[1] != 3 or rotations.shape != (len(shapes), 3, 3):
         raise DataError(f"'{path}' is no saved reconstruction: shapes are {shapes.shape}, not (F,3,P)")
+    if used.dtype != bool or used.ndim != 1 or used.sum() != len(shapes):
+        raise DataError(f"'{path}' is no saved reconstruction: used does not tell which frames its {len(shapes)} are")
     try:
         loss, seconds = float(arrays["loss"]), float(arrays["seconds"])
     except (TypeError, ValueError) as error:
         raise DataError(f"'{path}' is no saved reconstruction: loss and seconds are no numbers") from error
-    return Reconstruction(shapes, rotations, arrays.get("codes"), loss, seconds)
+    return Reconstruction(used, shapes, rotations, arrays.get("codes"), loss, seconds)
 
 
 @dataclass(frozen=True)
@@ -185,7 +190,8 @@ def reconstruction_of(runs: list[Run]) -> Reconstruction:
         if code is not None:
             codes[rows] = code.cpu().numpy()
     seconds = sum(run.trainer.seconds for run in runs)
-    return Reconstruction(shapes, rotations, codes if trainer.recipe.steps else None, runs[0].loss, seconds)
+    codes = codes if trainer.recipe.steps else None
+    return Reconstruction(trainer.data.used, shapes, rotations, codes, runs[0].loss, seconds)
 
 
 @torch.no_grad()
