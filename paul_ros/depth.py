@@ -48,11 +48,14 @@ class Depths:
     ) -> tuple[Lifted, dict[str, int]]:
         """Persons at their measured distance where there is one, and how many were moved and how many it cannot be of.
 
-        surface: metres from what is measured to the root. Without metres, or depths of that stamp, none is moved.
+        surface: metres from what is measured to the root. Without metres, or depths of that stamp, none is moved; what
+        is wrong with the images is told by its name.
         """
         image = min(self._images, key=lambda image: abs(image.stamp - stamp), default=None)
-        if image is None or abs(image.stamp - stamp) > _NEAR or camera is None or lifted.units != "m":
+        if image is None or camera is None or lifted.units != "m" or not lifted.ok.any():
             return lifted, {}
+        if abs(image.stamp - stamp) > _NEAR:
+            return lifted, {"depth_of_another_time": 1}
         if camera.width and image.values.shape != (camera.height, camera.width):
             return lifted, {"depth_of_another_size": 1}
         depth = np.array([_measured(image, root, camera) for root in lifted.root]) + surface

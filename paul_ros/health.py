@@ -53,25 +53,27 @@ class Aloud:
 class Report:
     """level: one of OK, WARN, ERROR, STALE; message: one line; values: name -> what /diagnostics tells of it.
 
-    frames: since the last report. silence: seconds without keypoints, None before the first.
+    frames: since the last report. waited: seconds without keypoints, before the first since it began to wait for them.
     """
 
     level: int
     message: str
     values: dict
     frames: int
-    silence: float | None
+    waited: float
 
 
 class Health:
     """Counts what comes and goes, and reports on the time since the last report. Times are in seconds, monotonic."""
 
-    def __init__(self, now: float) -> None:
-        self._since, self._last_input = now, None
+    def __init__(self, now: float, drops: Counter = Counter()) -> None:
+        """drops: that are old news."""
+        self._began = self._since = now
+        self._last_input: float | None = None
         self._came = self._went = 0
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._doubts: list = []
-        self._counted: Counter = Counter()
+        self._counted = Counter(drops)
         self._mismatches = 0
 
     def came(self, now: float) -> None:
@@ -104,7 +106,7 @@ class Health:
         frames, values = self._went, self._values(now, silence, stream, source)
         self._since, self._came, self._went, self._mismatches = now, 0, 0, 0
         self._counted, self._doubts = Counter(stream.drops), []
-        return Report(level, message, values, frames, silence)
+        return Report(level, message, values, frames, now - self._began if silence is None else silence)
 
     def _level(self, drops: Counter, silence: float | None, problem: str, stream: LiftStream) -> tuple[int, str]:
         if problem:

@@ -37,9 +37,12 @@ class KeypointInput:
         take: Callable[[str, object, str, int], None],
         most: Callable[[], int],
         warn: Aloud,
+        nobody: Callable[[], None],
         mismatch: Callable[[str, str], None],
     ) -> None:
         """wanted: a type's name, or auto; most(): bodies to follow; mismatch(topic, text): QoS that do not match.
+
+        nobody() is told each list that has no body: then no message of one can come.
 
         take(type_name, msg, topic, missed) gets each message, a PointCloud2 as serialised bytes, and how many before it
         were published but never came, or were replaced by newer ones while the node was busy. Raises ValueError where
@@ -50,7 +53,7 @@ class KeypointInput:
         self.type_name: str | None = None
         self.problem = ""
         self._node, self._wanted, self._take, self._most = node, wanted, take, most
-        self._warn, self._mismatch = warn, mismatch
+        self._warn, self._nobody, self._mismatch = warn, nobody, mismatch
         self.topic = node.resolve_topic_name(topic)
         self._subscription: Subscription | None = None
         self._bodies: Tracked | None = None
@@ -60,6 +63,7 @@ class KeypointInput:
         types = [self._wanted] if self._wanted != "auto" else self._published_types()
         known = [name for name in types if name in readable()]
         if not types:
+            self.problem = ""
             self._warn("no input", f"nobody publishes {self.topic} yet; remap `keypoints` to your detector")
         elif not known:
             self._cannot(
@@ -71,6 +75,31 @@ class KeypointInput:
             self._open(known[0])
         return self.type_name is not None
 
+    def check(self) -> bool:
+        """Whether look() has done its work: not where the type is found from the graph and has become another.
+
+        Where the wanted type is not the one that is published, that is said aloud.
+        """
+        if self.type_name is None:
+            return True
+        types = self._published_types()
+        if not types or self.type_name in types:
+            self.problem = ""
+            return True
+        if self._wanted == "auto":
+            self.close()
+            return False
+        self._cannot(
+            "other type",
+            f"{self.topic} has the type {', '.join(types)}, but input_type is {self._wanted}: nothing comes from it; "
+            "correct input_type, or leave it at auto",
+        )
+        return True
+
+    def alone(self) -> str:
+        """': nobody publishes it ...' where that is so, else ''."""
+        return "" if self._published_types() else ": nobody publishes it; remap `keypoints` to your detector"
+
     def close(self) -> None:
         """Ends all subscriptions; look() may open them again."""
         if self._bodies:
@@ -81,6 +110,8 @@ class KeypointInput:
 
     def _follow(self, msg) -> None:
         """Reads the bodies that a list names."""
+        if not msg.ids:
+            self._nobody()
         if left := self._bodies.update(msg.ids, self._most()):
             self._warn("bodies", f"bodies that are not read, by their ids: {', '.join(map(repr, left[:5]))}")
 

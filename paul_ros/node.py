@@ -62,8 +62,8 @@ _REPORT_SECONDS = 1.0
 _SILENT_SECONDS = 5.0
 #: Detectors that send a message a person send those of one image in one go: two such silences tell that they are all.
 _SILENCE_SECONDS = 0.005
-#: Model units are worth a warning so often: who has no CameraInfo knows it.
-_UNITS_SECONDS = 60.0
+#: What is odd but used, as model units, is worth a warning so often: who has no CameraInfo knows it.
+_NOTES_SECONDS = 60.0
 #: An idle node looks this often whether a signal asked it to end.
 _STOP_SECONDS = 0.2
 #: Parameters that take another stream.
@@ -116,7 +116,7 @@ class LifterNode(LifecycleNode):
         self._subscribed: list = []
         self._timers_on: list = []
         self.add_on_set_parameters_callback(self._take_parameters)
-        back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1))
+        back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jumps = self.get_clock().create_jump_callback(back, post_callback=self._on_jump)
 
     @property
@@ -198,10 +198,12 @@ class LifterNode(LifecycleNode):
             self._on_keypoints,
             lambda: self.stream.max_persons,
             self._warn,
+            self._on_nobody,
             self._on_mismatch,
         )
         self._health = Health(time.monotonic())
-        self._told, self._described, self._reported = self.stream.route, {}, Counter()
+        self._told, self._described = self.stream.route, {}
+        self._reported, self._noted = Counter(), Counter()
         self._outputs = {
             name: self._publisher(message_class(type_name), f"~/{name}") for name, type_name in OUTPUTS.items()
         }
@@ -226,7 +228,7 @@ class LifterNode(LifecycleNode):
         return made
 
     def _activate(self) -> None:
-        self._health = Health(time.monotonic())
+        self._health = Health(time.monotonic(), self.stream.drops)
         # Discovery takes its time: that nobody publishes is worth a warning only after a while.
         self._warn.hold("no input")
         self._silences, self._described = 0, {}
@@ -329,8 +331,6 @@ class LifterNode(LifecycleNode):
     def _on_camera_info(self, msg: CameraInfo) -> None:
         self.stream.camera_info(msg)
         self._report_drops()
-        if self.stream.notes["distorted_image"]:
-            self._warn("distorted_image", self.stream.explanations["distorted_image"], every=_UNITS_SECONDS)
         self._publish_layout()
 
     def _on_depth(self, msg: Image) -> None:
@@ -346,6 +346,10 @@ class LifterNode(LifecycleNode):
         if type_name in msg_adapters.ONE_PERSON:
             self._silences = 0
             self._silence.reset()
+
+    def _on_nobody(self) -> None:
+        """The input lives, it only shows nobody."""
+        self._health.came(time.monotonic())
 
     def _on_silence(self) -> None:
         """Flushes at the second tick: at the first, if this process was kept from running, a message may be waiting."""
@@ -424,19 +428,30 @@ class LifterNode(LifecycleNode):
                 explanation = self.stream.explanations.get(reason, "")
                 self._warn(reason, f"dropped: {reason}, {count} so far. {explanation}")
 
+    def _report_notes(self) -> None:
+        """What was odd but used, where the stream knows what to do about it."""
+        for what in self.stream.notes.keys() & self.stream.explanations.keys():
+            count = self.stream.notes[what]
+            if count != self._noted[what]:
+                self._noted[what] = count
+                self._warn(what, f"{what}, {count} so far. {self.stream.explanations[what]}", every=_NOTES_SECONDS)
+
     def _report(self) -> None:
         """/diagnostics (REP-107), once a second."""
+        if not self._input.check():
+            self._looking.reset()
         source = self._input.type_name or "none"
         report = self._health.report(time.monotonic(), self.stream, self._input.problem, source)
         message = DiagnosticArray(status=[self._status(report)])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
-        if report.silence and report.silence >= _SILENT_SECONDS:
-            self._warn("silent", f"no keypoints for {report.silence:.0f} s on {self._input.topic}")
+        self._report_notes()
+        if self._input.type_name and not self._input.problem and report.waited >= _SILENT_SECONDS:
+            self._warn("silent", f"no keypoints for {report.waited:.0f} s on {self._input.topic}{self._input.alone()}")
         # Not before the first second is over: CameraInfo may come a little later than the keypoints.
         if report.frames and unscaled(self.stream):
             why = self._described["scale_source"]
-            self._warn("units", f"lifting in model units, not metres: {why}", every=_UNITS_SECONDS)
+            self._warn("units", f"lifting in model units, not metres: {why}", every=_NOTES_SECONDS)
 
     def _status(self, report: Report) -> DiagnosticStatus:
         return DiagnosticStatus(

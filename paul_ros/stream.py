@@ -43,6 +43,13 @@ _LEFT_OUT = {
     TOO_FAR: f"it would stand more than {MAX_DISTANCE:.0f} m away; if it does not, check camera_info",
     BEHIND_CAMERA: "it would stand beside or behind the camera; check camera_info and the layout of the keypoints",
 }
+#: Why depth images are of no use.
+_DEPTH_UNUSED = {
+    "depth_of_another_size": "depth images have not the size that CameraInfo tells, so they are not aligned to the "
+    "image of the keypoints and are not used; remap `depth` to the images that are",
+    "depth_of_another_time": "no depth image within 20 ms of the keypoints' stamp had come before them, so distances "
+    "are not measured there; is `depth` of the same clock, and as often?",
+}
 
 _log = logging.getLogger(__name__)
 
@@ -383,6 +390,7 @@ class LiftStream:
         lifted, said = self._depths.place(lifted, given.stamp, self.intrinsics, surface)
         if said:
             self.notes += Counter(said)
+            self.explanations.update({what: _DEPTH_UNUSED[what] for what in said.keys() & _DEPTH_UNUSED.keys()})
         lifted = self._filter(given.ids, given.stamp, lifted, model.layout.root)
         unit = self.lifter.metres_per_unit if lifted.units == "m" else 1.0
         visible = np.where(lifted.ok[:, None], lifted.used, given.visible)

@@ -120,13 +120,15 @@ def test_what_is_no_measure_of_the_person_changes_nothing(stream, make, metres, 
     np.testing.assert_array_equal(frame.lifted.points, plain.lifted.points)
     np.testing.assert_array_equal(frame.lifted.distance_sigma, plain.lifted.distance_sigma)
     assert stream.notes == note
+    assert ("remap `depth`" in str(stream.explanations)) == ("depth_of_another_size" in note)
 
 
 def test_only_the_image_of_that_time_counts(stream, make):
     truth = two(0.7)
     stream.depth(depth_image(make, background(truth)))
     late = stream.keypoints(CLOUD, cloud(make, seen(truth), seconds=7, nanoseconds=40_000_000))
-    assert not stream.notes and late.lifted.root[0, 2] > 1.2 * truth[0, 11, 2]
+    assert stream.notes == {"depth_of_another_time": 1} and late.lifted.root[0, 2] > 1.2 * truth[0, 11, 2]
+    assert "same clock" in stream.explanations["depth_of_another_time"]
     for seconds in range(8, 20):
         stream.depth(depth_image(make, background(truth), header=header_of(make, seconds=seconds)))
     stream.keypoints(CLOUD, cloud(make, seen(truth), nanoseconds=10_000_000))

@@ -42,12 +42,13 @@ def test_all_is_well(health, stream):
     run(health)
     report = health.report(101.0, stream)
     assert (report.level, report.message) == (OK, "1 frames since the last report, units: m")
-    assert report.frames == 1 and report.silence == pytest.approx(0.5)
+    assert report.frames == 1 and report.waited == pytest.approx(0.5)
 
 
 def test_nothing_yet_then_silence_then_stale(health, stream):
     assert health.report(101.0, stream).level == WARN
-    assert "no keypoints yet" in health.report(102.0, stream).message
+    never = health.report(102.0, stream)
+    assert "no keypoints yet" in never.message and never.waited == 2
     run(health, 103.0)
     assert health.report(103.0, stream).level == OK
     quiet = health.report(104.0, stream)
@@ -83,6 +84,16 @@ def test_drops_are_a_warning_and_an_error_where_nothing_is_left(health, stream):
     report = health.report(102.0, stream)
     assert report.level == ERROR and "could be used; dropped: 1 wrong_fields" in report.message
     assert report.values["dropped_wrong_fields"] == 2
+
+
+def test_drops_of_before_it_was_activated_are_old_news(stream):
+    stream.drops.update(internal_error=2, not_2d=3)
+    health = Health(100.0, stream.drops)
+    run(health)
+    report = health.report(101.0, stream)
+    assert report.level == OK and report.values["dropped_not_2d"] == 3
+    stream.drops["not_2d"] += 1
+    assert "dropped: 1 not_2d" in health.report(102.0, stream).message
 
 
 def test_a_person_left_out_or_a_message_lost_is_no_error(health, stream):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import array
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -310,6 +311,15 @@ def test_an_input_that_cannot_be_read_is_named_and_a_good_one_is_found_later(ros
     bench.close()
 
 
+def test_a_detector_of_another_type_is_found_when_the_first_has_gone(ros, start_lifter, model_file):
+    lifter = start_lifter("-p", f"model:={model_file}")
+    for kind in ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray"):
+        bench = Bench(ros, lifter, kind)
+        bench.until(lambda kind=kind: f"reading {kind}" in lifter.log(), f"a subscription of {kind}")
+        bench.until(bench.keypoints.get_subscription_count, "the subscription")
+        bench.close()
+
+
 def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, model_file):
     lifter = start_lifter("-p", f"model:={model_file}", "-p", "input_type:=yolo_msgs/msg/DetectionArray")
     bench = Bench(ros, lifter)
@@ -385,6 +395,47 @@ def lifter_node(ros, monkeypatch):
     node.start()
     yield node
     node.destroy_node()
+
+
+@pytest.fixture
+def said(lifter_node, monkeypatch):
+    """What the node warns of, at once and each time."""
+    from paul_ros import node
+
+    texts = []
+    for limit in ("_SILENT_SECONDS", "_NOTES_SECONDS"):
+        monkeypatch.setattr(node, limit, 0.0)
+    monkeypatch.setattr(lifter_node._warn, "_every", 0.0)
+    monkeypatch.setattr(lifter_node._warn, "_say", texts.append)
+    return texts
+
+
+def test_silence_is_said_from_the_start(ros, lifter_node, said):
+    detector = ros.create_node("detector")
+    publisher = detector.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "keypoints", 10)
+    end = time.monotonic() + PATIENCE
+    while not lifter_node._input.type_name:
+        assert time.monotonic() < end
+        lifter_node._look()
+    said.clear()
+    lifter_node._report()
+    assert len(said) == 1 and re.fullmatch(r"no keypoints for \d+ s on /keypoints", said[0])
+    detector.destroy_publisher(publisher)
+    while not said[-1].endswith("nobody publishes it; remap `keypoints` to your detector"):
+        assert time.monotonic() < end, said
+        lifter_node._report()
+    detector.destroy_node()
+
+
+def test_what_was_odd_but_used_is_said_with_what_to_do(lifter_node, said):
+    distorted = camera_info(MAKE)
+    distorted.d = [0.1, 0.0, 0.0, 0.0, 0.0]
+    for count in (1, 2):
+        lifter_node._on_camera_info(distorted)
+        lifter_node._report_notes()
+        assert said.pop().startswith(f"distorted_image, {count} so far. CameraInfo has distortion but no P")
+    lifter_node._report_notes()
+    assert not said
 
 
 @dataclass

@@ -8,7 +8,7 @@ import time
 
 import pytest
 from conftest import camera_info
-from node_bench import MAKE, Bench, class_of, good
+from node_bench import MAKE, Bench, class_of, good, set_parameters
 
 
 @pytest.fixture
@@ -119,6 +119,14 @@ def test_an_input_whose_override_cannot_be_is_an_error_in_diagnostics(started):
     assert bench.next_diagnostics().level == b"\x02" and "Traceback" not in bench.lifter.log()
 
 
+def test_an_input_type_that_is_not_the_published_one_is_an_error(started):
+    bench = started("-p", "input_type:=geometry_msgs/msg/PoseArray")
+    said = "has the type sensor_msgs/msg/PointCloud2, but input_type is geometry_msgs/msg/PoseArray"
+    bench.until(lambda: said in bench.lifter.log(), "the warning")
+    bench.until(lambda: said in bench.next_diagnostics().message, "the diagnostics")
+    assert bench.next_diagnostics().level == b"\x02"
+
+
 def test_simulated_time_that_is_set_back(started):
     """As a bag that loops: diagnostics go on while it stands, the node lifts on, and says that time was set back."""
     bench = started("-p", "use_sim_time:=true")
@@ -144,6 +152,12 @@ def test_simulated_time_that_is_set_back(started):
     bench.until(at(5), "diagnostics after the jump")
     assert bench.lifter.log().count(said) == 1
     bench.lifts()
+    # Another clock is none that was set.
+    for simulated in (False, True):
+        assert set_parameters(bench, use_sim_time=simulated) == [""]
+    tick(5)
+    bench.until(at(5), "diagnostics of simulated time again")
+    assert bench.lifter.log().count("time was set back") == 1
     count = len(stamps())
     bench.until(lambda: len(stamps()) >= count + 2, "diagnostics while time stands still")
     assert stamps()[-1] == 5 * 10**9

@@ -87,6 +87,14 @@ def test_bodies_are_read_as_their_ids_come_and_go(ros, start_lifter, model_file,
         bench.until(read(*names), f"subscriptions of {names}")
         if names:
             bench.until(lambda names=names: persons(bench, bench.show(*names)) == len(names), f"{names} in 3D")
+
+    def well():
+        bench.show()
+        bench.ros.spin_once(bench.node, timeout_sec=0.03)
+        _, status = bench.got["diagnostics"][-1]
+        return status.level == b"\x00" and status.message.startswith("0 frames")
+
+    bench.until(well, "level OK while there is nobody")
     assert f"reading {LIST}" in lifter.log() and "Traceback" not in lifter.log()
     bench.show("c", "1st")
     bench.until(lambda: "bodies that are not read, by their ids: '1st'" in lifter.log(), "the warning")
