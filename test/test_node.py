@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import array
 import json
+import os
 import re
 import signal
 import subprocess
@@ -281,6 +282,15 @@ def test_a_signal_in_the_midst_of_frames_ends_it_cleanly(ros, start_lifter, mode
     log = bench.lifter.log()
     assert "Traceback" not in log and "internal_error" not in log
     assert log.splitlines()[-1].startswith("lifter: ")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_process_imports_ends_it_cleanly(tmp_path, number):
+    (tmp_path / "rclpy.py").write_text(f"import os, time\nos.kill(os.getpid(), {int(number)})\ntime.sleep(10)\n")
+    env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+    env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(ROOT)])
+    done = subprocess.run([sys.executable, "-m", "paul_ros.node"], env=env, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_pose_array_of_a_best_effort_publisher(ros, start_lifter, model_file):
