@@ -3,7 +3,8 @@
 
 A skeleton has 70 slots whatever its body_format; only the first 18, 34 or 38 are filled, the rest is zero.
 NaN, negative and (0, 0) mean missing. There is no confidence a keypoint, only one of the whole object. Objects
-without a skeleton are none that could be lifted.
+without a skeleton are none that could be lifted. The header names the camera's frame (NAME_left_camera_frame: x
+forward), not the optical one that CameraInfo has (zed-ros2-wrapper, publishing of bodies).
 """
 
 from __future__ import annotations

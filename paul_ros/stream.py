@@ -219,6 +219,7 @@ class LiftStream:
         self._output_layout = output_layout
         self._last_stamp: int | None = None
         self._image_size: tuple[int, int] | None = None
+        self._camera_frame: str | None = None
         self._gathered = _Gathered()
         self._measures, self._steady = left_and_up(lifter.model.layout), Steady()
         self._bone_width = _BONE_WIDTH * float(np.ptp(lifter.model.mean_shape, axis=1).max())
@@ -259,6 +260,7 @@ class LiftStream:
     def take_over(self, before: LiftStream) -> None:
         """Goes on where another stream stopped: camera, depth images and counts are those of before."""
         self.intrinsics, self._image_size = before.intrinsics, before._image_size
+        self._camera_frame = before._camera_frame
         self._depths, self._steady, self._last_stamp = before._depths, before._steady, before._last_stamp
         self.counts, self.drops, self.notes = before.counts, before.drops, before.notes
         self.explanations, self.lift_us = before.explanations, before.lift_us
@@ -268,7 +270,7 @@ class LiftStream:
         with self.guard():
             # A camera that is not calibrated has a size too.
             self._image_size = (int(msg.width), int(msg.height))
-            self.intrinsics = msg_adapters.read_camera_info(msg)
+            self.intrinsics, self._camera_frame = msg_adapters.read_camera_info(msg), str(msg.header.frame_id)
             if self.intrinsics.distorted:
                 self.notes["distorted_image"] += 1
                 self.explanations["distorted_image"] = (
@@ -379,6 +381,7 @@ class LiftStream:
         if self._last_stamp is not None and given.stamp < self._last_stamp:
             self.notes["stamp_backwards"] += 1
         self._last_stamp = given.stamp
+        self._note_frame(given.frame_id)
         lifted = self._lift(given)
         self.counts.update(frames=1, persons=given.persons, lifted=int(lifted.ok.sum()))
         for reason in filter(None, lifted.reason):
@@ -416,6 +419,16 @@ class LiftStream:
         if keypoints.persons:
             self.lift_us.append((time.perf_counter_ns() - start) / 1000)
         return lifted
+
+    def _note_frame(self, frame_id: str) -> None:
+        """Image and CameraInfo of one camera have one frame, its optical one (REP-104): another is not that."""
+        if self._camera_frame is not None and frame_id != self._camera_frame:
+            self.notes["another_frame"] += 1
+            self.explanations["another_frame"] = (
+                f"the keypoints' frame_id is {frame_id!r}, CameraInfo's {self._camera_frame!r}: is it of their camera? "
+                "What is published has the keypoints' frame_id and the axes of an optical frame (x right, y down, "
+                "z forward), so let the detector name the optical frame"
+            )
 
     def _note_unlike(self, persons: int) -> None:
         if persons:

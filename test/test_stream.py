@@ -79,6 +79,18 @@ def test_the_description_says_which_matrix_of_camera_info_was_used(stream, make)
     assert "rectify" in stream.explanations["distorted_image"]
 
 
+def test_keypoints_of_another_frame_than_the_cameras_are_noted(stream, make):
+    """As of ZED cameras, whose bodies come in a frame that is not optical: in that they would lie on their side."""
+    odd = cloud(make, seen(persons_at((0, 0, 4))), frame="zed_left_camera_frame")
+    stream.keypoints(CLOUD, odd)
+    assert not stream.notes
+    stream.camera_info(camera_info(make))
+    stream.keypoints(CLOUD, cloud(make, seen(persons_at((0, 0, 4)))))
+    assert not stream.notes
+    assert stream.keypoints(CLOUD, odd).lifted.ok.all() and stream.notes["another_frame"] == 1
+    assert "'zed_left_camera_frame', CameraInfo's 'camera_color" in stream.explanations["another_frame"]
+
+
 def test_persons_far_away_are_left_out_and_explained(stream, make):
     stream.camera_info(camera_info(make))
     stream.keypoints(CLOUD, cloud(make, seen(persons_at((0, 0, 4), (0, 0, 250), (0, 0, 2000)))))
