@@ -51,11 +51,13 @@ class Source:
     names: of the layout's P keypoints, for families that tell which point is which; () = unknown.
     image_size: width and height in pixels, for families that normalise by them; None = unknown.
     topic: that the message came from, for families that put the person's id there; '' = unknown.
+    optical_frame: CameraInfo's frame_id, for families whose header names another frame of the camera; '' = unknown.
     """
 
     names: tuple[str, ...] = ()
     image_size: tuple[int, int] | None = None
     topic: str = ""
+    optical_frame: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class Keypoints2D:
     visible: (N, P) bool.
     ids: N person ids as text, '' where unknown.
     stamp: nanoseconds, from the message's header.
-    frame_id: from the message's header.
+    frame_id: the camera's optical frame: what the message's header names, in nearly all families.
     """
 
     xy: np.ndarray

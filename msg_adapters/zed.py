@@ -3,11 +3,13 @@
 
 A skeleton has 70 slots whatever its body_format; only the first 18, 34 or 38 are filled, the rest is zero.
 NaN, negative and (0, 0) mean missing. There is no confidence a keypoint, only one of the whole object. Objects
-without a skeleton are none that could be lifted. The header names the camera's frame (NAME_left_camera_frame: x
-forward), not the optical one that CameraInfo has (zed-ros2-wrapper, publishing of bodies).
+without a skeleton are none that could be lifted. The header names the camera's own frame (NAME_left_camera_frame: x
+forward), where the pixels are of the optical one, whose name CameraInfo has (zed-ros2-wrapper, publishing of bodies).
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,19 +41,19 @@ _ORDERS = {0: OPENPOSE18, 1: BODY34, 2: BODY38}
 
 
 def read(msg, points: int, source: Source) -> Keypoints2D:
-    """Reads the objects that have a skeleton as persons of a layout with `points` keypoints.
+    """Reads the objects that have a skeleton as persons of a layout with `points` keypoints; frame_id is CameraInfo's.
 
     Fields: objects[] with skeleton_available, body_format, skeleton_2d.keypoints[70].kp[2], label_id.
     Raises MessageError: unknown_body_format, no_common_names.
     """
     bodies = [thing for thing in msg.objects if thing.skeleton_available]
     if not bodies:
-        return nobody(points, msg.header)
+        return replace(nobody(points, msg.header), frame_id=source.optical_frame)
     xy = np.stack([_placed(body, source.names) for body in bodies])
     present = (xy >= 0).all(axis=-1) & (xy != 0).any(axis=-1)
     # The SDK gives -1 where tracking is off.
     ids = tuple(str(body.label_id) if body.label_id >= 0 else "" for body in bodies)
-    return record(xy, None, ids, msg.header, present)
+    return replace(record(xy, None, ids, msg.header, present), frame_id=source.optical_frame)
 
 
 def layout(msg) -> str | None:

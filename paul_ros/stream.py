@@ -8,6 +8,7 @@ holds may stop the stream: what cannot be used is dropped, counted by its reason
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import logging
 import time
@@ -268,9 +269,9 @@ class LiftStream:
     def camera_info(self, msg) -> None:
         """Takes the intrinsics; of an unusable CameraInfo nothing is taken and the drop is counted."""
         with self.guard():
-            # A camera that is not calibrated has a size too.
-            self._image_size = (int(msg.width), int(msg.height))
-            self.intrinsics, self._camera_frame = msg_adapters.read_camera_info(msg), str(msg.header.frame_id)
+            # A camera that is not calibrated has a size and a frame too.
+            self._image_size, self._camera_frame = (int(msg.width), int(msg.height)), str(msg.header.frame_id)
+            self.intrinsics = msg_adapters.read_camera_info(msg)
             if self.intrinsics.distorted:
                 self.notes["distorted_image"] += 1
                 self.explanations["distorted_image"] = (
@@ -294,10 +295,11 @@ class LiftStream:
             if isinstance(msg, bytes):
                 msg = self._cloud(msg)
             keypoints = self._read(type_name, msg, topic)
+            header = _optical(msg.header, keypoints.frame_id)
             # Without a stamp nothing tells which persons are of one image.
             if type_name in msg_adapters.ONE_PERSON and keypoints.stamp:
-                return self._gather(msg.header, keypoints)
-            return self._frame(msg.header, keypoints)
+                return self._gather(header, keypoints)
+            return self._frame(header, keypoints)
         return None
 
     def flush(self) -> Frame | None:
@@ -356,7 +358,7 @@ class LiftStream:
     def _read(self, type_name: str, msg, topic: str) -> Keypoints2D:
         """In the model's layout."""
         route = self.route
-        source = Source(route.given.names, self._image_size, topic)
+        source = Source(route.given.names, self._image_size, topic, self._camera_frame or "")
         if self._known:
             keypoints = msg_adapters.read(type_name, msg, len(source.names), source)
             self._check_persons(keypoints.persons)
@@ -472,6 +474,15 @@ class _Gathered:
         """Header and all persons, in the order they came; then there is nobody."""
         parts, self.parts = self.parts, []
         return self.header, msg_adapters.join(parts)
+
+
+def _optical(header, frame_id: str):
+    """A message's header as the outputs have it: with the optical frame, where it names another of the camera's."""
+    if header.frame_id == frame_id:
+        return header
+    header = copy.copy(header)
+    header.frame_id = frame_id
+    return header
 
 
 def _scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) -> str:

@@ -23,7 +23,8 @@ def make(request, bag_make):
 
 
 def source(names=COCO, **changes) -> Source:
-    return Source(**{"names": tuple(names), "image_size": foreign.SIZE, **changes})
+    known = {"image_size": foreign.SIZE, "optical_frame": "camera_color_optical_frame"}
+    return Source(**{"names": tuple(names), **known, **changes})
 
 
 def read_of(make, type_name: str, msg, names=COCO, **changes):
@@ -131,7 +132,7 @@ def test_hri_id_is_in_the_topic(make, topic, ident):
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_zed_takes_the_slots_of_its_format_by_name(make, body_format, own, layout):
     names = load_layout(layout).names
-    msg = foreign.zed(make, header_of(make), [POSE, POSE], body_format)
+    msg = foreign.zed(make, header_of(make, frame="zed_left_camera_frame"), [POSE, POSE], body_format)
     for body in msg.objects:  # what lies behind is zero in a real message, and none of our business
         for slot in body.skeleton_2d.keypoints[len(own) :]:
             slot.kp[:] = 99.0

@@ -8,6 +8,7 @@ import contextlib
 import logging
 from dataclasses import replace
 
+import foreign_messages as foreign
 import numpy as np
 import pytest
 from conftest import PERSON, camera_info, header_of, persons_at, seen
@@ -77,6 +78,21 @@ def test_the_description_says_which_matrix_of_camera_info_was_used(stream, make)
     # Used all the same: it is a note, not a drop.
     assert stream.notes == {"distorted_image": 1} and not stream.drops and stream.units == "m"
     assert "rectify" in stream.explanations["distorted_image"]
+
+
+@pytest.mark.parametrize("kind", ["live", "bag"])
+def test_zed_bodies_are_in_the_optical_frame_of_camera_info(stream, bag_make, kind):
+    """Their header names the camera's own frame, x forward: what is lifted would lie on its side in that."""
+    foreign_make = foreign.LiveMake() if kind == "live" else bag_make
+    header = header_of(foreign_make, frame="zed_left_camera_frame")
+    pose = dict(zip(stream.route.given.names, seen(persons_at((0, 0, 4)))[0].tolist()))
+    msg = foreign.zed(foreign_make, header, [pose], 0)
+    frames = [stream.keypoints(foreign.ZED, msg)]
+    stream.camera_info(camera_info(bag_make))
+    frames.append(stream.keypoints(foreign.ZED, msg))
+    assert [frame.header.frame_id for frame in frames] == ["", "camera_color_optical_frame"]
+    assert frames[1].header.stamp == header.stamp
+    assert frames[1].lifted.ok.all() and header.frame_id == "zed_left_camera_frame" and not stream.notes
 
 
 def test_keypoints_of_another_frame_than_the_cameras_are_noted(stream, make):
