@@ -3,7 +3,8 @@
 
 ERROR: the input cannot be read, a fault of the node itself since the last report, or every message since then was of no
 use. STALE: keypoints came once, but none for STALE_SECONDS. WARN: no keypoints yet or since the last report, something
-was dropped, a QoS does not match, or points are in model units though the model knows its metres. OK: none of these.
+was dropped, a QoS does not match, keypoints name another frame than the camera's, most persons are like no shape of the
+model, or points are in model units though the model knows its metres. OK: none of these.
 """
 
 from __future__ import annotations
@@ -66,14 +67,14 @@ class Report:
 class Health:
     """Counts what comes and goes, and reports on the time since the last report. Times are in seconds, monotonic."""
 
-    def __init__(self, now: float, drops: Counter = Counter()) -> None:
-        """drops: that are old news."""
+    def __init__(self, now: float, drops: Counter = Counter(), notes: Counter = Counter()) -> None:
+        """drops, notes: that are old news."""
         self._began = self._since = now
         self._last_input: float | None = None
         self._came = self._went = 0
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._doubts: list = []
-        self._counted = Counter(drops)
+        self._counted, self._noted = Counter(drops), Counter(notes)
         self._mismatches = 0
 
     def came(self, now: float) -> None:
@@ -105,7 +106,7 @@ class Health:
         level, message = self._level(drops, silence, problem, stream)
         frames, values = self._went, self._values(now, silence, stream, source)
         self._since, self._came, self._went, self._mismatches = now, 0, 0, 0
-        self._counted, self._doubts = Counter(stream.drops), []
+        self._counted, self._noted, self._doubts = Counter(stream.drops), Counter(stream.notes), []
         return Report(level, message, values, frames, now - self._began if silence is None else silence)
 
     def _level(self, drops: Counter, silence: float | None, problem: str, stream: LiftStream) -> tuple[int, str]:
@@ -131,6 +132,11 @@ class Health:
             yield f"dropped: {listed(drops)}"
         if self._mismatches:
             yield f"{self._mismatches} endpoints with a QoS that does not match"
+        notes = stream.notes - self._noted
+        if notes["another_frame"]:
+            yield stream.explanations["another_frame"]
+        if notes["unlike_the_model"] > 0.5 * self._lifted():
+            yield stream.explanations["unlike_the_model"]
         if unscaled(stream) and self._went:
             yield "no metres, for no usable CameraInfo has come"
 
@@ -155,6 +161,10 @@ class Health:
             "input_type": source,
             **{key: told[key] for key in ("input_layout", "layout", "model", "model_sha256")},
         }
+
+    def _lifted(self) -> int:
+        """Persons since the last report."""
+        return sum(int(np.isfinite(ambiguity).sum()) for _, ambiguity in self._doubts)
 
     def _shares(self) -> dict:
         """Of the persons that were lifted since the last report; a person that was not has no ambiguity."""

@@ -233,7 +233,7 @@ class LifterNode(LifecycleNode):
         return made
 
     def _activate(self) -> None:
-        self._health = Health(time.monotonic(), self.stream.drops)
+        self._health = Health(time.monotonic(), self.stream.drops, self.stream.notes)
         # Discovery takes its time: that nobody publishes is worth a warning only after a while.
         self._warn.hold("no input")
         self._silences, self._described = 0, {}
@@ -447,9 +447,6 @@ class LifterNode(LifecycleNode):
             self._looking.reset()
         source = self._input.type_name or "none"
         report = self._health.report(time.monotonic(), self.stream, self._input.problem, source)
-        message = DiagnosticArray(status=[self._status(report)])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
         self._report_notes()
         if self._input.type_name and not self._input.problem and report.waited >= _SILENT_SECONDS:
             self._warn("silent", f"no keypoints for {report.waited:.0f} s on {self._input.topic}{self._input.alone()}")
@@ -457,6 +454,9 @@ class LifterNode(LifecycleNode):
         if report.frames and unscaled(self.stream):
             why = self._described["scale_source"]
             self._warn("units", f"lifting in model units, not metres: {why}", every=_NOTES_SECONDS)
+        message = DiagnosticArray(status=[self._status(report)])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
 
     def _status(self, report: Report) -> DiagnosticStatus:
         return DiagnosticStatus(

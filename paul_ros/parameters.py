@@ -72,7 +72,7 @@ PARAMETERS = (
         "input_type",
         "auto",
         "Message type of `keypoints`, as sensor_msgs/msg/PointCloud2; "
-        "auto = the type of the first publisher that can be read.",
+        "auto = the type of the first publisher that can be read, or of the next when that has gone.",
     ),
     Parameter(
         "person_height",

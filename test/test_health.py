@@ -96,6 +96,22 @@ def test_drops_of_before_it_was_activated_are_old_news(stream):
     assert "dropped: 1 not_2d" in health.report(102.0, stream).message
 
 
+def test_what_is_odd_but_lifted_is_a_warning_as_long_as_it_lasts(stream):
+    stream.notes.update(another_frame=4, unlike_the_model=9)
+    stream.explanations.update(another_frame="another frame", unlike_the_model="hardly those")
+    health = Health(100.0, stream.drops, stream.notes)
+    run(health)
+    assert health.report(101.0, stream).level == OK
+    run(health, 102.0)
+    run(health, 102.5)
+    stream.notes["unlike_the_model"] += 1
+    assert health.report(103.0, stream).level == OK, "half of the persons may be odd, as some detections are"
+    run(health, 104.0)
+    stream.notes.update(another_frame=1, unlike_the_model=1)
+    report = health.report(104.0, stream)
+    assert report.level == WARN and report.message.startswith("another frame; hardly those; 1 frames")
+
+
 def test_a_person_left_out_or_a_message_lost_is_no_error(health, stream):
     health.came(100.5)  # and waits for the rest of its image
     stream.drops["missed"] += 3
