@@ -103,7 +103,8 @@ def test_what_is_unexplained_is_a_share_of_the_extent(rigid_lifter, model, camer
     truth = np.concatenate([standing(model, [0, 0, 4]), standing(model, [0, 0, 8])])
     order = np.random.default_rng(0).permutation(17)
     right, wrong = (rigid_lifter.lift(pinhole(some), everything(truth), camera) for some in (truth, truth[:, order]))
-    assert right.unexplained.max() < 0.03 and wrong.unexplained.min() > 0.6
+    # Without intrinsics the perspective is not explained.
+    assert right.unexplained.max() < (0.03 if camera else 0.1) and wrong.unexplained.min() > 0.6
     extent = np.sqrt(pinhole(truth).var(1).sum(1))
     np.testing.assert_allclose(wrong.unexplained, wrong.reprojection / extent, rtol=0.03)
 
