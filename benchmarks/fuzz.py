@@ -597,22 +597,31 @@ def sound_bag_of_unsound_messages(bench: Bench, rng: random.Random, path: Path) 
 def model_session(bench, rng, tally, cases, where):
     path = bench.folder / "broken.npz"
     for _ in range(cases):
-        tally.cases += 1
-        start = time.process_time()
         path.write_bytes(broken_model(bench, rng))
-        try:
-            model = load_model(path)
-            xy = np.random.default_rng(0).normal(300, 80, (2, len(model.layout.names), 2))
-            lifted = Lifter(model).lift(xy, np.ones(xy.shape[:2], bool))
-            if not np.isfinite(lifted.points[lifted.ok]).all():
-                raise Wrong("points of a lifted person are not finite")
-            tally.accepted += 1
-        except ModelError as error:
-            tally.refused += 1
-            one_line(error, tally, where)
-        except Exception:
-            tally.crash(where)
-        tally.slowest_ms = max(tally.slowest_ms, 1000 * (time.process_time() - start))
+        attempt(lambda: lift_with(path), ModelError, tally, where)
+
+
+def attempt(use: Callable[[], object], promised: type[Exception], tally: Tally, where: str) -> None:
+    """One case: accepted, refused by the error that is promised, or a crash."""
+    tally.cases += 1
+    start = time.process_time()
+    try:
+        use()
+        tally.accepted += 1
+    except promised as error:
+        tally.refused += 1
+        one_line(error, tally, where)
+    except Exception:
+        tally.crash(where)
+    tally.slowest_ms = max(tally.slowest_ms, 1000 * (time.process_time() - start))
+
+
+def lift_with(path: Path) -> None:
+    model = load_model(path)
+    xy = np.random.default_rng(0).normal(300, 80, (2, len(model.layout.names), 2))
+    lifted = Lifter(model).lift(xy, np.ones(xy.shape[:2], bool))
+    if not np.isfinite(lifted.points[lifted.ok]).all():
+        raise Wrong("points of a lifted person are not finite")
 
 
 def broken_model(bench: Bench, rng: random.Random) -> bytes:
@@ -643,18 +652,8 @@ def layout_session(bench, rng, tally, cases, where):
     path, whole = bench.folder / "broken.yaml", load_layout("coco17").to_dict()
     text = yaml.safe_dump(whole).encode()
     for _ in range(cases):
-        tally.cases += 1
-        start = time.process_time()
         path.write_bytes(break_bytes(text, rng) if rng.random() < 0.5 else broken_layout(whole, rng))
-        try:
-            load_layout(path)
-            tally.accepted += 1
-        except LayoutError as error:
-            tally.refused += 1
-            one_line(error, tally, where)
-        except Exception:
-            tally.crash(where)
-        tally.slowest_ms = max(tally.slowest_ms, 1000 * (time.process_time() - start))
+        attempt(lambda: load_layout(path), LayoutError, tally, where)
 
 
 def broken_layout(whole: dict, rng: random.Random) -> bytes:

@@ -220,7 +220,7 @@ class LiftStream:
         self._output_layout = output_layout
         self._last_stamp: int | None = None
         self._image_size: tuple[int, int] | None = None
-        self._camera_frame: str | None = None
+        self._camera_frame = ""
         self._gathered = _Gathered()
         self._measures, self._steady = left_and_up(lifter.model.layout), Steady()
         self._bone_width = _BONE_WIDTH * float(np.ptp(lifter.model.mean_shape, axis=1).max())
@@ -358,7 +358,7 @@ class LiftStream:
     def _read(self, type_name: str, msg, topic: str) -> Keypoints2D:
         """In the model's layout."""
         route = self.route
-        source = Source(route.given.names, self._image_size, topic, self._camera_frame or "")
+        source = Source(route.given.names, self._image_size, topic, self._camera_frame)
         if self._known:
             keypoints = msg_adapters.read(type_name, msg, len(source.names), source)
             self._check_persons(keypoints.persons)
@@ -424,7 +424,7 @@ class LiftStream:
 
     def _note_frame(self, frame_id: str) -> None:
         """Image and CameraInfo of one camera have one frame, its optical one (REP-104): another is not that."""
-        if self._camera_frame is not None and frame_id != self._camera_frame:
+        if self._camera_frame and frame_id != self._camera_frame:
             self.notes["another_frame"] += 1
             self.explanations["another_frame"] = (
                 f"the keypoints' frame_id is {frame_id!r}, CameraInfo's {self._camera_frame!r}: is it of their camera? "

@@ -96,15 +96,18 @@ def test_zed_bodies_are_in_the_optical_frame_of_camera_info(stream, bag_make, ki
 
 
 def test_keypoints_of_another_frame_than_the_cameras_are_noted(stream, make):
-    """As of ZED cameras, whose bodies come in a frame that is not optical: in that they would lie on their side."""
-    odd = cloud(make, seen(persons_at((0, 0, 4))), frame="zed_left_camera_frame")
+    """In a frame that is not optical they would lie on their side; a CameraInfo that names none says nothing."""
+    odd = cloud(make, seen(persons_at((0, 0, 4))), frame="left_camera_frame")
+    nameless = camera_info(make)
+    nameless.header.frame_id = ""
+    stream.camera_info(nameless)
     stream.keypoints(CLOUD, odd)
     assert not stream.notes
     stream.camera_info(camera_info(make))
     stream.keypoints(CLOUD, cloud(make, seen(persons_at((0, 0, 4)))))
     assert not stream.notes
     assert stream.keypoints(CLOUD, odd).lifted.ok.all() and stream.notes["another_frame"] == 1
-    assert "'zed_left_camera_frame', CameraInfo's 'camera_color" in stream.explanations["another_frame"]
+    assert "'left_camera_frame', CameraInfo's 'camera_color" in stream.explanations["another_frame"]
 
 
 def test_persons_far_away_are_left_out_and_explained(stream, make):
