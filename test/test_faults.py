@@ -247,7 +247,12 @@ def test_a_recording_that_is_killed_is_readable(tmp_path, kind):
     out = tmp_path / "lifted.mcap"
     part = out.with_name("lifted.mcap.part")
     process = subprocess.Popen(
-        [*REPLAY, str(out)], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        [*REPLAY, str(out)],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background has it ignored
     )
     end = time.monotonic() + PATIENCE
     while not (part.exists() and part.stat().st_size > 300_000):
