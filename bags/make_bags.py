@@ -21,9 +21,9 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))  # run from a checkout that nobody installed
 
 from msg_adapters.outputs import keypoints_cloud, pose_array  # noqa: E402
-from paul_ros.bag import BagMessages, BagWriter  # noqa: E402
-from paul_ros.skeleton import load_layout  # noqa: E402
-from training.mocap import layout_points  # noqa: E402
+from paul_ros.layout import load_layout  # noqa: E402
+from paul_ros.offline.bag import BagMessages, BagWriter  # noqa: E402
+from training.people.mocap import layout_points  # noqa: E402
 
 RATE = 30  # Hz
 START = 1_750_000_000 * 1_000_000_000  # ns; any time will do

@@ -22,13 +22,13 @@ import torch
 from paul_ros.files import write_atomically
 from paul_ros.metrics import normalised_error_of_signs
 from training.data import load_training_data
+from training.judge.pictures import COLOURS, legend_above, new_figure, save_figure, titled
+from training.judge.truth import Sequence, load_sequence
 from training.objective import Views, fit
-from training.pictures import COLOURS, legend_above, new_figure, save_figure, titled
 from training.recipe import Recipe
-from training.starting import Start, kept_start, start_identity
-from training.synchronise import aligned
+from training.start.kept_start import Start, kept_start, start_identity
+from training.start.synchronise import aligned
 from training.trainer import Trainer
-from training.truth import Sequence, load_sequence
 
 JUDGED = 3000  # frames, evenly chosen
 STARTS = {"2D": "from 2D alone", "truth": "from the true 3D"}

@@ -44,7 +44,7 @@ def main() -> None:
     settings = [f"steps={steps}", f"batch={args.batch}", *args.set]
     with tempfile.TemporaryDirectory() as folder:
         mesh, model, report = (Path(folder) / name for name in ("mesh.npz", "model.npz", "report.json"))
-        run("training.synthetic", "-o", mesh, "--points", args.points, "--frames", args.frames)
+        run("training.judge.synthetic", "-o", mesh, "--points", args.points, "--frames", args.frames)
         overrides = [word for setting in settings for word in ("--set", setting)]
         outputs = ("-o", model, "--shapes", Path(folder) / "shapes.npz", "--json", report)
         used = run("paul_ros.cli", "train", mesh, *outputs, "--quiet", "--threads", args.threads, *overrides)

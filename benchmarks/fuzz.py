@@ -52,13 +52,14 @@ import yaml
 import msg_adapters
 from msg_adapters import MessageError, outputs
 from msg_adapters.cdr import CloudReader
-from paul_ros.bag import BagError, BagMessages, BagWriter, read_records
+from paul_ros.errors import BagError, LayoutError, ModelError
 from paul_ros.files import write_atomically
+from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model import ModelError, load_model, weight_shapes
-from paul_ros.replay import Topics, evaluate, replay
-from paul_ros.skeleton import LayoutError, load_layout
-from paul_ros.stream import PACKED, LiftStream
+from paul_ros.model import load_model, weight_shapes
+from paul_ros.offline.bag import BagMessages, BagWriter, read_records
+from paul_ros.offline.replay import Topics, evaluate, replay
+from paul_ros.stream.stream import PACKED, LiftStream
 
 SESSION = 25  # cases
 BODIES = "/humans/bodies/{}/skeleton2d"
@@ -718,7 +719,7 @@ def session(bench: Bench, kind: str, number: int, tally: Tally, seed: int = 0, c
 
 def fuzz(cases: int, seed: int = 0, kinds=tuple(KINDS), tick: Callable[[int], None] = lambda done: None) -> dict:
     """The report over so many cases."""
-    logging.getLogger("paul_ros.stream").setLevel(logging.CRITICAL)  # a traceback for every first internal error
+    logging.getLogger("paul_ros.stream.stream").setLevel(logging.CRITICAL)  # a traceback for every first internal error
     share = sum(KINDS[kind] for kind in kinds)
     tallies = {kind: Tally() for kind in kinds}
     start = time.perf_counter()

@@ -20,14 +20,14 @@ from tqdm import tqdm
 
 from training.data import load_training_data
 from training.export import export_model
-from training.human_data import make_file
-from training.mocap import human_layout
+from training.judge.truth import load_sequence
+from training.people.human_data import make_file
+from training.people.mocap import human_layout
 from training.recipe import Recipe
 from training.reconstruction import final_loss
-from training.starting import START_UNIT, Start, kept_start, start_identity
-from training.synchronise import aligned
+from training.start.kept_start import START_UNIT, Start, kept_start, start_identity
+from training.start.synchronise import aligned
 from training.trainer import Trainer
-from training.truth import load_sequence
 
 
 def labels(trainer: Trainer, S: np.ndarray) -> Start:

@@ -4,8 +4,9 @@
 
     python benchmarks/human_model.py CMU_FOLDER [--models human,other.npz] [--json F] [--plot F.png] [--trials]
 
-Frames of the held-out trials, evenly chosen from each, every one from a camera of its own (training/view_settings.py,
-but whole in the image and of the captured people's own proportions), lifted one by one with the camera's intrinsics.
+Frames of the held-out trials, evenly chosen from each, every one from a camera of its own
+(training/people/view_settings.py, but whole in the image and of the captured people's own proportions), lifted one by
+one with the camera's intrinsics.
 What differs from row to row is the detector's layout, the level of its errors (1: the measured noise profile), the
 share of points that it misses and the distance.  Errors are over all points of the detector's layout that the model
 has, hidden ones too, and over the 12 joints of the limbs that all layouts have; of the root's position the median is
@@ -25,12 +26,12 @@ from tqdm import tqdm
 from msg_adapters import Intrinsics
 from paul_ros import metrics
 from paul_ros.files import write_atomically
+from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifted, Lifter
 from paul_ros.model import DEFAULT_MODEL, load_model
-from paul_ros.skeleton import load_layout
-from training.human_data import HELD_OUT, Seen, read_clips, see
-from training.mocap import human_layout, human_points
-from training.pictures import COLOURS, new_figure, save_figure, titled
+from training.judge.pictures import COLOURS, new_figure, save_figure, titled
+from training.people.human_data import HELD_OUT, Seen, read_clips, see
+from training.people.mocap import human_layout, human_points
 from training.recipe import Recipe
 
 LAYOUTS = ("coco17", "body25", "openpose18", "h36m17", "mediapipe33")

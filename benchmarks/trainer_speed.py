@@ -31,10 +31,10 @@ from torch.nn import functional as F
 from paul_ros.files import write_atomically
 from paul_ros.model import load_model
 from training.data import TrainingData
+from training.judge.truth import random_rotations
 from training.networks import build_networks
 from training.recipe import Recipe
 from training.trainer import Trainer
-from training.truth import random_rotations
 
 STEPS = 10  # of each in a round
 FRAMES = 4000

@@ -17,13 +17,13 @@ import numpy as np
 
 from msg_adapters import Intrinsics
 from paul_ros import metrics
-from paul_ros.bag import read_messages
 from paul_ros.files import write_atomically
+from paul_ros.layout import load_layout
 from paul_ros.model import load_model
+from paul_ros.offline.bag import read_messages
 from paul_ros.onp import OnP, onp
+from paul_ros.pinhole_pose import refine
 from paul_ros.placement import centred_view, place
-from paul_ros.refine import refine
-from paul_ros.skeleton import load_layout
 
 HERE = Path(__file__).resolve().parent
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)

@@ -11,11 +11,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from paul_ros.errors import NpzError
+
 _NAMED = 5  # arrays in a message
-
-
-class NpzError(ValueError):
-    """An npz that cannot be used; the text says why, and goes after the file's name."""
 
 
 def read_npz(

@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from msg_adapters.keypoints import Intrinsics
-from paul_ros.model import Model, ModelError, RigidModel, enough_visible
+from paul_ros.errors import ModelError
+from paul_ros.layout import middles
+from paul_ros.model import Model, RigidModel, enough_visible
 from paul_ros.onp import onp
+from paul_ros.pinhole_pose import refine
 from paul_ros.placement import centred_view, place
-from paul_ros.refine import refine
-from paul_ros.skeleton import middles
 
 TOO_FEW_POINTS = "too_few_points"
 DEGENERATE_POINTS = "degenerate_points"

@@ -23,8 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
+from paul_ros.errors import LayoutError, ModelError
 from paul_ros.files import write_atomically
-from paul_ros.skeleton import Layout, LayoutError, Part
+from paul_ros.layout import Layout, Part
 
 FORMAT_VERSION = 1
 DEFAULT_MODEL = "human"
@@ -34,10 +35,6 @@ _DIGEST_CHARS = 64
 _MAX_BYTES = 256 * 2**20
 _MAX_LAYERS = 100
 _MAX_WIDTH = 2**14
-
-
-class ModelError(ValueError):
-    """A model that cannot be used; the text says what to do."""
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 
 Weak perspective holds on the optical axis, and people stand beside it.  So each person is first seen by a virtual
 camera turned towards it: the rays of its keypoints are rotated until the person's own direction is the optical axis.
-Lifting happens there (``paul_ros.refine`` adds what perspective is left); the result is rotated back.  With scale ``s``
-(normalised image units per model unit) and ``m`` metres per model unit, similar triangles give the distance ``m / s``.
+Lifting happens there (``paul_ros.pinhole_pose`` adds what perspective is left); the result is rotated back.
+With scale ``s`` (normalised image units per model unit) and ``m`` metres per model unit, similar triangles give the
+distance ``m / s``.
 """
 
 from __future__ import annotations

@@ -110,8 +110,8 @@ FOCAL, CENTRE = 600.0, (320.0, 240.0)
 @pytest.fixture(scope="session")
 def model_file(tmp_path_factory) -> Path:
     """A model file whose every shape is PERSON: its only weights that are not zero are the last bias."""
+    from paul_ros.layout import load_layout
     from paul_ros.model import save_model, to_unit_size, weight_shapes
-    from paul_ros.skeleton import load_layout
 
     layout = load_layout("coco17")
     shape = to_unit_size(PERSON.T[None], layout)[0]
@@ -137,8 +137,8 @@ def model_file(tmp_path_factory) -> Path:
 
 def coco_model():
     """The shipped model as one of COCO-17 alone: its weights for the other points left out."""
+    from paul_ros.layout import load_layout
     from paul_ros.model import Model, load_model, to_unit_size
-    from paul_ros.skeleton import load_layout
 
     human, coco = load_model(), load_layout("coco17")
     own = np.array([human.layout.names.index(name) for name in coco.names])
@@ -193,7 +193,7 @@ class LifterProcess:
         env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
         with open(self._log, "wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "paul_ros.node", "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
+                [sys.executable, "-m", "paul_ros.ros.node", "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
                 cwd=ROOT,
                 env=env,
                 stdout=log,

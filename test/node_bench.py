@@ -10,7 +10,7 @@ import numpy as np
 from conftest import LifterProcess, RosMake, header_of, persons_at, seen
 
 from msg_adapters import outputs
-from paul_ros.stream import OUTPUTS
+from paul_ros.stream.stream import OUTPUTS
 
 MAKE = RosMake()
 GOOD = persons_at((0.3, 0, 4))

@@ -11,7 +11,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
+from paul_ros.errors import BagError
+from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
 
 POSES = "geometry_msgs/msg/PoseArray"
 TICK = 33_333_333

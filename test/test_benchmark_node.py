@@ -16,11 +16,12 @@ from conftest import ROOT
 
 import msg_adapters
 from paul_ros import cli
-from paul_ros.bag import BagError, _jazzy
 from paul_ros.benchmarks import node
 from paul_ros.benchmarks.node import Turn, clouds, cpu_seconds, memory_growth, ratios, row, spread
 from paul_ros.benchmarks.node_report import table
 from paul_ros.benchmarks.traffic import NODES
+from paul_ros.errors import BagError
+from paul_ros.offline.bag import _jazzy
 
 KEYS = {
     "node",

@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 
 from paul_ros import cli
-from training import experiments, reconstruction, starting
-from training.benchmark import METHODS, find_sequences
-from training.data import DataError
-from training.experiments import Keeping, Outcome, Run, chosen, perform, summary
-from training.published import NORMALISED_ERROR_PERCENT, published
+from training import reconstruction
+from training.errors import DataError, TrainingError
+from training.judge import experiments
+from training.judge.experiments import Keeping, Outcome, Run, chosen, perform, summary
+from training.judge.nrsfm import METHODS, find_sequences
+from training.judge.published import NORMALISED_ERROR_PERCENT, published
+from training.judge.truth import Sequence
 from training.recipe import Recipe
 from training.reconstruction import Reconstruction
-from training.starting import Start
-from training.trainer import TrainingError
-from training.truth import Sequence
+from training.start import kept_start as starting
+from training.start.kept_start import Start
 
 FRAMES, POINTS = 9, 14
 

@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tiny_data import FROM_RANDOM_WEIGHTS
 
+from paul_ros.layout import Layout, anonymous_layout, load_layout
 from paul_ros.lifter import TOO_FEW_POINTS, Lifter
 from paul_ros.model import load_model
-from paul_ros.skeleton import Layout, anonymous_layout, load_layout
-from training import cli
+from training import command as cli
 from training.categories import among_categories, joint_layout, load_files
-from training.data import DataError
-from training.evaluation import evaluate_model
+from training.errors import DataError
+from training.judge.evaluation import evaluate_model
+from training.judge.truth import load_sequence
 from training.networks import build_networks
 from training.objective import Views, own_points, paul_terms
 from training.recipe import Recipe
-from training.truth import load_sequence
 
 SMALL = [word for item in ("steps=8", "width=16", "batch=8", "bottleneck=3") for word in ("--set", item)]
 

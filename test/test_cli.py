@@ -15,7 +15,7 @@ from conftest import header_of, persons_at, seen
 
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros import __version__, cli
-from paul_ros.bag import BagWriter
+from paul_ros.offline.bag import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
 ONE = ROOT / "bags" / "one_person.mcap"
@@ -74,7 +74,7 @@ def test_the_bag_that_is_read_is_never_overwritten(tmp_path, capsys, option, nam
 @pytest.mark.parametrize("output, clue", [("", "it is a folder"), ("file/x", "cannot write")])
 def test_an_output_that_cannot_be_written_is_told_first(tmp_path, capsys, monkeypatch, option, output, clue):
     (tmp_path / "file").touch()
-    monkeypatch.setattr("paul_ros.replay.replay", lambda *_: pytest.fail("lifted in vain"))
+    monkeypatch.setattr("paul_ros.offline.replay.replay", lambda *_: pytest.fail("lifted in vain"))
     assert cli.main(["replay", str(ONE), option, str(tmp_path / output)]) == 1
     printed = capsys.readouterr()
     assert clue in printed.err and printed.err.count("\n") == 1

@@ -16,7 +16,7 @@ from foreign_messages import HRI, SIZE, YOLO, hri
 from node_bench import Bench
 
 from msg_adapters import hri as hri_adapter
-from paul_ros.skeleton import load_layout
+from paul_ros.layout import load_layout
 
 pytestmark = pytest.mark.skipif(bool(lacking()), reason=f"message packages need {lacking()} to be compiled")
 

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from test_foreign_bags import BODIES, FRAMES, IDS, PIXELS, Factory, image_messages, topics_for, write
 
 from msg_adapters import read_camera_info
-from paul_ros.bag import BagWriter
+from paul_ros.layout import load_layout
+from paul_ros.offline.bag import BagWriter
 from paul_ros.placement import centred_view
-from paul_ros.skeleton import load_layout
 from training import data as module
-from training.data import DataError, check_sizes, load_training_data
+from training.data import check_sizes, load_training_data
+from training.errors import DataError
 
 
 def views(frames=6, points=9, seed=0):

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
-from paul_ros.demo import BAGS, DemoError, compare, find_bag, run_live
-from paul_ros.replay import replay
-from paul_ros.stream import open_stream
+from paul_ros.errors import BagError, DemoError
+from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
+from paul_ros.offline.demo import BAGS, compare, find_bag, run_live
+from paul_ros.offline.replay import replay
+from paul_ros.stream.stream import open_stream
 
 
 @pytest.fixture(scope="module")

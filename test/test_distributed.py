@@ -12,11 +12,11 @@ import pytest
 import torch
 from tiny_data import sequence, true_start
 
-from paul_ros.skeleton import load_layout
-from training import starting
+from paul_ros.layout import load_layout
 from training.data import load_training_data
 from training.distributed import WHOLE, from_first, is_first, share_of
 from training.recipe import Recipe
+from training.start import kept_start as starting
 from training.trainer import LOG_COLUMNS, Trainer
 
 COCO = load_layout("coco17")

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from paul_ros import cli, metrics
+from paul_ros.layout import load_layout
 from paul_ros.model import load_model, save_model
-from paul_ros.skeleton import load_layout
-from training import evaluation
-from training.data import DataError
+from training.errors import DataError
+from training.judge import evaluation
+from training.judge.truth import Sequence, load_sequence, random_rotations
 from training.reconstruction import Reconstruction
-from training.truth import Sequence, load_sequence, random_rotations
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -9,9 +9,9 @@ import torch
 from conftest import coco_model
 from scipy.spatial.transform import Rotation
 
+from paul_ros.layout import anonymous_layout, load_layout
 from paul_ros.model import load_model
 from paul_ros.onp import onp
-from paul_ros.skeleton import anonymous_layout, load_layout
 from training import export
 from training.categories import joint_layout
 from training.data import load_training_data

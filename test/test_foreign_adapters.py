@@ -9,7 +9,7 @@ import pytest
 from conftest import ROOT, header_of
 
 from msg_adapters import SUPPORTED, MessageError, Source, WrongPointCount, hri, openpose, read, zed
-from paul_ros.skeleton import layout_names, load_layout
+from paul_ros.layout import layout_names, load_layout
 
 COCO = load_layout("coco17").names
 ALL_NAMES = tuple(dict.fromkeys(name for layout in layout_names() for name in load_layout(layout).names))

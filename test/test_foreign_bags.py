@@ -13,12 +13,13 @@ from conftest import camera_info, header_of, persons_at, seen
 import msg_adapters
 from msg_adapters import outputs
 from paul_ros import cli
-from paul_ros.bag import BagError, BagMessages, BagWriter, matches, read_records
+from paul_ros.errors import BagError
+from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
 from paul_ros.model import load_model
-from paul_ros.replay import Topics, replay
-from paul_ros.skeleton import load_layout
-from paul_ros.stream import LiftStream, open_stream
+from paul_ros.offline.bag import BagMessages, BagWriter, matches, read_records
+from paul_ros.offline.replay import Topics, replay
+from paul_ros.stream.stream import LiftStream, open_stream
 
 COCO = load_layout("coco17").names
 FRAMES = 3

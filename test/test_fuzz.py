@@ -20,9 +20,10 @@ from hypothesis import strategies as st
 import msg_adapters
 from msg_adapters import MessageError
 from msg_adapters.plugins import Adapter, Adapters
+from paul_ros.errors import ModelError
 from paul_ros.lifter import Lifter
-from paul_ros.model import ModelError, load_model
-from paul_ros.stream import LiftStream
+from paul_ros.model import load_model
+from paul_ros.stream.stream import LiftStream
 
 SCRIPT = Path(__file__).resolve().parent.parent / "benchmarks/fuzz.py"
 _spec = importlib.util.spec_from_file_location("fuzz", SCRIPT)
@@ -39,7 +40,7 @@ def bench(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def quiet():
     """Every first internal error of a stream is logged with its traceback."""
-    log = logging.getLogger("paul_ros.stream")
+    log = logging.getLogger("paul_ros.stream.stream")
     log.setLevel(logging.CRITICAL)
     yield
     log.setLevel(logging.NOTSET)

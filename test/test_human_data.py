@@ -15,17 +15,19 @@ import pytest
 from test_distributed import TORCHRUN
 
 from msg_adapters.keypoints import Intrinsics
+from paul_ros.errors import LayoutError
+from paul_ros.layout import load_layout
 from paul_ros.model import load_model
 from paul_ros.placement import centred_view
-from paul_ros.skeleton import LayoutError, load_layout
-from training import cli, human_data
-from training.cameras import hidden_by_body, random_cameras
-from training.data import DataError, load_training_data
-from training.detector import detect, redefined, reported
-from training.human_data import other_people, see
-from training.mocap import CMU31, PARENTS, MocapError, human_layout, human_mapping, human_points, layout_points
-from training.recipe import RecipeError
-from training.view_settings import COMPLETE, Views, ViewsError
+from training import command as cli
+from training.data import load_training_data
+from training.errors import DataError, MocapError, RecipeError, ViewsError
+from training.people import human_data
+from training.people.cameras import hidden_by_body, random_cameras
+from training.people.detector import detect, redefined, reported
+from training.people.human_data import other_people, see
+from training.people.mocap import CMU31, PARENTS, human_layout, human_mapping, human_points, layout_points
+from training.people.view_settings import COMPLETE, Views
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = ROOT / "bags" / "source"
@@ -430,7 +432,10 @@ def archive(tmp_path, joints):
 
 def command(*arguments):
     return subprocess.run(
-        [sys.executable, "-m", "training.human_data", *map(str, arguments)], capture_output=True, text=True, cwd=ROOT
+        [sys.executable, "-m", "training.people.human_data", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from training.linear_model import (
+from training.start.linear_model import (
     LinearModel,
     Moments,
     Observations,

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from training.asf_amc import read_amc, read_asf
-from training.bvh import read_bvh
-from training.human_data import motion_files, read_clips
-from training.mocap import CMU31, PARENTS, MocapError
+from training.errors import MocapError
+from training.people.asf_amc import read_amc, read_asf
+from training.people.bvh import read_bvh
+from training.people.human_data import motion_files, read_clips
+from training.people.mocap import CMU31, PARENTS
 
 METRES = 0.0254 / 0.45
 DOF = {

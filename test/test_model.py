@@ -11,9 +11,10 @@ import zipfile
 import numpy as np
 import pytest
 
+from paul_ros.errors import ModelError
+from paul_ros.layout import load_layout
 from paul_ros.model import (
     Model,
-    ModelError,
     centre,
     enough_visible,
     load_model,
@@ -23,7 +24,6 @@ from paul_ros.model import (
     to_unit_size,
     weight_shapes,
 )
-from paul_ros.skeleton import load_layout
 
 LAYOUT = load_layout("coco17")
 

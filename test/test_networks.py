@@ -7,8 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from paul_ros.errors import ModelError
+from paul_ros.layout import Layout, anonymous_layout, load_layout
 from paul_ros.model import (
-    ModelError,
     check_size,
     dictionary_sizes,
     load_model,
@@ -19,7 +20,6 @@ from paul_ros.model import (
     upright,
     weight_shapes,
 )
-from paul_ros.skeleton import Layout, anonymous_layout, load_layout
 from training import networks as networks_module
 from training.export import architecture
 from training.networks import build_networks, main_axes

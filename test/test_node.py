@@ -23,10 +23,10 @@ from node_bench import GOOD, MAKE, PATIENCE, Bench, class_of, cloud, good, heade
 
 import msg_adapters
 from msg_adapters import outputs
-from paul_ros import parameters
-from paul_ros.depth import SURFACE
-from paul_ros.skeleton import load_layout
-from paul_ros.stream import OUTPUTS
+from paul_ros.layout import load_layout
+from paul_ros.stream import parameters
+from paul_ros.stream.depth import SURFACE
+from paul_ros.stream.stream import OUTPUTS
 
 
 def half_way(seconds: int):
@@ -229,7 +229,7 @@ def test_no_torch_in_the_node(bench):
         mapped = maps.read()
     assert "rclpy" in mapped and "torch" not in mapped
     done = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "paul_ros.node", "--help"],
+        [sys.executable, "-X", "importtime", "-m", "paul_ros.ros.node", "--help"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -289,7 +289,9 @@ def test_a_signal_while_the_process_imports_ends_it_cleanly(tmp_path, number):
     (tmp_path / "rclpy.py").write_text(f"import os, time\nos.kill(os.getpid(), {int(number)})\ntime.sleep(10)\n")
     env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
     env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(ROOT)])
-    done = subprocess.run([sys.executable, "-m", "paul_ros.node"], env=env, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-m", "paul_ros.ros.node"], env=env, capture_output=True, text=True, timeout=60
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -341,7 +343,7 @@ def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, mod
 @pytest.mark.parametrize("type_name", sorted(set(FOREIGN) & set(msg_adapters.SUPPORTED)))
 def test_every_foreign_package_that_is_missing_is_named(type_name):
     """The node's warning is made of this error."""
-    from paul_ros.ros import message_class
+    from paul_ros.ros.endpoints import message_class
 
     with pytest.raises(ImportError, match=type_name.split("/")[0]):
         message_class(type_name)
@@ -399,7 +401,7 @@ def lifter_node(ros, monkeypatch):
     # Importing the node limits the threads of its process; that is undone, for the tests after this.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         monkeypatch.setenv(variable, "1")
-    from paul_ros.node import LifterNode
+    from paul_ros.ros.node import LifterNode
 
     node = LifterNode()
     node.start()
@@ -410,7 +412,7 @@ def lifter_node(ros, monkeypatch):
 @pytest.fixture
 def said(lifter_node, monkeypatch):
     """What the node warns of, at once and each time."""
-    from paul_ros import node
+    from paul_ros.ros import node
 
     texts = []
     for limit in ("_SILENT_SECONDS", "_NOTES_SECONDS"):
@@ -564,7 +566,7 @@ def test_a_node_kept_from_running_between_two_persons_tears_no_image(lifter_node
 
 
 def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
-    from paul_ros.node import _spin
+    from paul_ros.ros.node import _spin
 
     one_person(lifter_node, opendr, 1, pose=POSES[0])
     stop = threading.Event()
@@ -589,7 +591,7 @@ def test_the_executor_waits_once_for_a_callback(lifter_node, monkeypatch):
     """rclpy's own waits a second time after each."""
     import rclpy.executors
 
-    from paul_ros.node import _OneThread
+    from paul_ros.ros.node import _OneThread
 
     waits, count = [], rclpy.executors.NumberOfEntities
     monkeypatch.setattr(rclpy.executors, "NumberOfEntities", lambda *sizes: waits.append(sizes) or count(*sizes))
@@ -621,5 +623,7 @@ def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
 
 def test_parameter_file_and_table_come_from_one_place():
     shipped = (ROOT / "config" / "lifter.yaml").read_text()
-    assert shipped == parameters.as_yaml(), "python -m paul_ros.parameters > config/lifter.yaml"
-    assert parameters.as_markdown() in (ROOT / "README.md").read_text(), "paste paul_ros.parameters.as_markdown()"
+    assert shipped == parameters.as_yaml(), "python -m paul_ros.stream.parameters > config/lifter.yaml"
+    assert parameters.as_markdown() in (ROOT / "README.md").read_text(), (
+        "paste paul_ros.stream.parameters.as_markdown()"
+    )

@@ -221,7 +221,7 @@ def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeyp
         monkeypatch.setenv(variable, "1")
     from rclpy.parameter import Parameter
 
-    from paul_ros.node import LifterNode
+    from paul_ros.ros.node import LifterNode
 
     node, models = LifterNode(), []
     node.start()
@@ -236,7 +236,7 @@ def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeyp
 
 
 def test_a_fault_in_a_transition_is_told_and_leads_back(ros, monkeypatch, capfd):
-    from paul_ros.node import LifterNode
+    from paul_ros.ros.node import LifterNode
 
     node = LifterNode()
     monkeypatch.setattr(node, "_configure", lambda: 1 / 0)

@@ -16,7 +16,7 @@ from foreign_messages import HRI, hri
 from node_bench import GOOD, MAKE, Bench, class_of, cloud, good
 from test_compiled_messages import compiled  # noqa: F401, a fixture
 
-from paul_ros.skeleton import load_layout
+from paul_ros.layout import load_layout
 
 pytestmark = pytest.mark.skipif(bool(lacking()), reason=f"message packages need {lacking()} to be compiled")
 

@@ -14,7 +14,7 @@ from conftest import ROOT
 from node_bench import MAKE, class_of
 
 from msg_adapters import outputs
-from paul_ros.stream import OPTIONAL, OUTPUTS
+from paul_ros.stream.stream import OPTIONAL, OUTPUTS
 
 PACKAGE = "paul_ros"
 POLICY = ElementTree.parse(ROOT / "sros2/lifter.policy.xml").getroot()

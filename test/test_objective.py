@@ -10,7 +10,7 @@ from conftest import coco_model
 from scipy.spatial.transform import Rotation
 from tiny_data import sequence
 
-from paul_ros.skeleton import load_layout
+from paul_ros.layout import load_layout
 from training.networks import build_networks
 from training.objective import (
     Views,

@@ -152,7 +152,7 @@ def test_the_launched_node_comes_up_and_ends_on_sigint(install: Install, model_f
 def test_the_installed_package_is_the_one_that_runs_and_has_its_files(install: Install) -> None:
     code = """
 import importlib.resources, paul_ros, training, msg_adapters
-from paul_ros.skeleton import layout_names
+from paul_ros.layout import layout_names
 print(paul_ros.__file__, ' '.join(layout_names()), sep='\\n')
 print(*sorted(f.name for f in (importlib.resources.files('paul_ros') / 'models').iterdir()))
 """
@@ -221,7 +221,7 @@ def test_the_launch_file_names_what_there_is() -> None:
     assert used == set(arguments)
     parameters = ROOT / arguments["config"].removeprefix(f"$(find-pkg-share {PACKAGE})/")
     assert yaml.safe_load(parameters.read_text())["/**"]["ros__parameters"]
-    node_source = (ROOT / "paul_ros/node.py").read_text(encoding="utf-8")
+    node_source = (ROOT / "paul_ros/ros/node.py").read_text(encoding="utf-8")
     for remap in node.findall("remap"):
         assert f'"{remap.get("from")}"' in node_source
 

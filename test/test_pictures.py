@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from training import benchmark
-from training.experiments import Outcome, Run
-from training.pictures import new_figure, percent_axis
-from training.published import NORMALISED_ERROR_PERCENT
-from training.studies.study import studies
-from training.truth import Sequence
+from training.judge import nrsfm as benchmark
+from training.judge.experiments import Outcome, Run
+from training.judge.pictures import new_figure, percent_axis
+from training.judge.published import NORMALISED_ERROR_PERCENT
+from training.judge.studies.study import studies
+from training.judge.truth import Sequence
 
 FRAMES = 30
 

@@ -18,10 +18,10 @@ from node_bench import Bench
 
 import msg_adapters
 from msg_adapters import Adapter, Keypoints2D, MessageError, WrongPointCount, plugins, record
-from paul_ros.bag import BagMessages, BagWriter
 from paul_ros.lifter import Lifter
 from paul_ros.model import load_model
-from paul_ros.stream import LiftStream
+from paul_ros.offline.bag import BagMessages, BagWriter
+from paul_ros.stream.stream import LiftStream
 
 PEOPLE = "acme_msgs/msg/People"
 TRUE = persons_at((0.3, 0, 4), (-1, 0.1, 5))

@@ -12,15 +12,17 @@ from test_training import train
 from tiny_data import centred, sequence, true_start
 
 from paul_ros import cli as paul
-from paul_ros.bag import BagError
+from paul_ros.errors import BagError
 from paul_ros.metrics import normalised_error
 from paul_ros.model import load_model
-from training import cli, reconstruction, starting
-from training.data import DataError
+from training import command as cli
+from training import reconstruction
 from training.encoder_fit import fit_encoder
-from training.recipe import Recipe, RecipeError
+from training.errors import DataError, RecipeError, TrainingError
+from training.recipe import Recipe
 from training.reconstruction import load_reconstruction, reconstruct, train_restarts
-from training.trainer import Trainer, TrainingError
+from training.start import kept_start as starting
+from training.trainer import Trainer
 
 TINY = {
     "bottleneck": 3,

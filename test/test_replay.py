@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from paul_ros import metrics
-from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records, topics_of
+from paul_ros.errors import BagError, PictureError
+from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.replay import Topics, evaluate, flips, replay
-from paul_ros.report import PictureError, table, write_json, write_picture
-from paul_ros.skeleton import load_layout
-from paul_ros.stream import open_stream
+from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
+from paul_ros.offline.replay import Topics, evaluate, flips, replay
+from paul_ros.offline.report import table, write_json, write_picture
+from paul_ros.stream.stream import open_stream
 
 ROOT = Path(__file__).resolve().parent.parent
 BAGS = ROOT / "bags"

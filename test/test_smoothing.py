@@ -10,7 +10,7 @@ import pytest
 from conftest import PERSON
 
 from paul_ros.lifter import _nothing
-from paul_ros.smoothing import FORGET_SECONDS, OneEuro
+from paul_ros.stream.smoothing import FORGET_SECONDS, OneEuro
 
 HIPS = (11, 12)
 FRAME = 33_333_333  # ns

@@ -15,12 +15,12 @@ from conftest import PERSON, camera_info, header_of, persons_at, seen
 from scipy.spatial.transform import Rotation
 
 from msg_adapters import outputs
-from paul_ros import stream as module
+from paul_ros.errors import LayoutError, ModelError, ParameterError
+from paul_ros.layout import Layout, load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model import ModelError, load_model
-from paul_ros.parameters import ParameterError
-from paul_ros.skeleton import Layout, LayoutError, load_layout
-from paul_ros.stream import OUTPUTS, PACKED, LiftStream, open_stream
+from paul_ros.model import load_model
+from paul_ros.stream import stream as module
+from paul_ros.stream.stream import OUTPUTS, PACKED, LiftStream, open_stream
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 GOOD = persons_at((0.3, 0, 4), (-1, 0.1, 5))

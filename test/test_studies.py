@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from paul_ros import cli
+from paul_ros.layout import anonymous_layout
 from paul_ros.model import load_model, save_model, weight_shapes
-from paul_ros.skeleton import anonymous_layout
 from training import reconstruction
 from training.categories import joint_layout
+from training.judge.studies import interpolation
+from training.judge.studies.latent import roughness
+from training.judge.studies.study import studies
+from training.judge.truth import random_rotations
 from training.reconstruction import Reconstruction
-from training.studies import interpolation
-from training.studies.latent import roughness
-from training.studies.study import studies
-from training.truth import random_rotations
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES, POINTS = 12, 14

@@ -8,9 +8,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from paul_ros.metrics import procrustes
-from training import synchronise
-from training.linear_model import LinearModel, Observations
-from training.synchronise import (
+from training.start import synchronise
+from training.start.linear_model import LinearModel, Observations
+from training.start.synchronise import (
     agreeing_share,
     aligned,
     energy_outside,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from training.data import load_training_data
-from training.synthetic import _BONES, _skin, _surface, articulated_mesh, mesh_edges
+from training.judge.synthetic import _BONES, _skin, _surface, articulated_mesh, mesh_edges
 
 
 def test_the_same_seed_gives_the_same_body():
@@ -70,7 +70,7 @@ def test_the_file_can_be_trained_on_and_holds_no_truth_unasked(tmp_path):
     command = [
         sys.executable,
         "-m",
-        "training.synthetic",
+        "training.judge.synthetic",
         "-o",
         str(tmp_path / "m.npz"),
         "--points",

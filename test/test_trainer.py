@@ -11,14 +11,16 @@ import torch
 from scipy.spatial.transform import Rotation
 from tiny_data import sequence, true_start
 
+from paul_ros.layout import load_layout
 from paul_ros.onp import onp
-from paul_ros.skeleton import load_layout
-from training import starting, trainer
+from training import trainer
 from training.encoder_fit import fit_encoder
+from training.errors import RecipeError, TrainingError
 from training.objective import Views, fit
-from training.recipe import Recipe, RecipeError
+from training.recipe import Recipe
 from training.reconstruction import final_loss
-from training.trainer import Trainer, TrainingError, one_buffer, rule_share
+from training.start import kept_start as starting
+from training.trainer import Trainer, one_buffer, rule_share
 
 COCO = load_layout("coco17")
 TINY = {

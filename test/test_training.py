@@ -15,16 +15,18 @@ from scipy.spatial.transform import Rotation
 from tiny_data import FROM_RANDOM_WEIGHTS
 
 from msg_adapters.outputs import keypoints_cloud
-from paul_ros.bag import BagError, BagMessages, BagWriter, read_messages, read_records
-from paul_ros.model import ModelError, load_model
-from paul_ros.replay import replay
-from paul_ros.skeleton import load_layout
-from paul_ros.stream import open_stream
-from training import cli
-from training.data import DataError, load_training_data
+from paul_ros.errors import BagError, ModelError
+from paul_ros.layout import load_layout
+from paul_ros.model import load_model
+from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records
+from paul_ros.offline.replay import replay
+from paul_ros.stream.stream import open_stream
+from training import command as cli
+from training.data import load_training_data
+from training.errors import DataError, RecipeError, TrainingError
 from training.export import mean_shape, metres_per_unit
-from training.recipe import Recipe, RecipeError, recipe_names
-from training.trainer import Trainer, TrainingError
+from training.recipe import Recipe, recipe_names
+from training.trainer import Trainer
 
 COCO = load_layout("coco17")
 BAG = Path(__file__).parents[1] / "bags" / "one_person.mcap"

@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from training import linear_model, synchronise, warm_start
-from training.linear_model import LinearModel, Observations
-from training.starting import StartError
-from training.warm_start import linear_start, rigid_start
+from training.errors import StartError
+from training.start import linear_model, synchronise, warm_start
+from training.start.linear_model import LinearModel, Observations
+from training.start.warm_start import linear_start, rigid_start
 
 EASY = {
     "_STARTS": 8,

@@ -4,9 +4,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from paul_ros.skeleton import anonymous_layout
+from paul_ros.layout import anonymous_layout
 from training.data import TrainingData
-from training.starting import Start
+from training.start.kept_start import Start
 
 POINTS = 9
 

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from paul_ros.parameters import DEFAULTS
-from paul_ros.skeleton import Layout
-from training.data import DataError, TrainingData, load_training_data
-from training.truth import Sequence
+from paul_ros.layout import Layout
+from paul_ros.stream.parameters import DEFAULTS
+from training.data import TrainingData, load_training_data
+from training.errors import DataError
+from training.judge.truth import Sequence
 
 
 def load_files(

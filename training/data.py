@@ -16,11 +16,13 @@ from pathlib import Path
 import numpy as np
 
 import msg_adapters
-from paul_ros.files import NpzError, read_npz
+from paul_ros.errors import LayoutError, NpzError
+from paul_ros.files import read_npz
+from paul_ros.layout import Layout, anonymous_layout, load_layout
 from paul_ros.model import centre, enough_visible, min_visible
-from paul_ros.parameters import DEFAULTS
 from paul_ros.placement import centred_view
-from paul_ros.skeleton import Layout, LayoutError, anonymous_layout, load_layout
+from paul_ros.stream.parameters import DEFAULTS
+from training.errors import DataError
 
 ABSURD = 1e6
 """Coordinates beyond this are no pixels: they would only drown the rest in rounding error."""
@@ -45,10 +47,6 @@ _VARIED = 4.0
 
 _BLOCK = 1024
 """Frames that are looked at together: dense data is large, and a copy of it larger still."""
-
-
-class DataError(ValueError):
-    """Data that cannot be trained on; the text says what to do."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +244,7 @@ def _bag_keypoints(
     path: Path, layout: Layout, topic: str | None
 ) -> tuple[dict[str, list[msg_adapters.Keypoints2D]], msg_adapters.Intrinsics | None, str]:
     """Keypoint messages by topic, the camera, and why messages were refused, the last of every topic."""
-    from paul_ros.bag import matches, read_records  # needs the extra "bags"
+    from paul_ros.offline.bag import matches, read_records  # needs the extra "bags"
 
     camera, size, refused = _bag_camera(path)
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
@@ -270,7 +268,7 @@ def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, 
 
     Read before the keypoints: some are shares of the image, and the first of them may come before any CameraInfo.
     """
-    from paul_ros.bag import read_records
+    from paul_ros.offline.bag import read_records
 
     refused: dict[str, str] = {}
     cameras: set[msg_adapters.Intrinsics] = set()

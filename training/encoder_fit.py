@@ -7,7 +7,7 @@ import math
 
 import torch
 
-from training.starting import Progress
+from training.start.kept_start import Progress
 from training.trainer import Trainer, turned_views
 
 STEPS = 3000

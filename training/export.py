@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 import paul_ros
+from paul_ros.layout import Layout
 from paul_ros.metrics import procrustes
 from paul_ros.model import save_model
-from paul_ros.skeleton import Layout
 from training.objective import fit
 from training.recipe import Recipe
 from training.trainer import Trainer, predict_shapes, rule_share

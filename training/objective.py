@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
-from paul_ros.skeleton import Layout
+from paul_ros.layout import Layout
 from training.distributed import WHOLE, Share
 from training.networks import Paul, edge_lengths
 from training.recipe import Recipe

@@ -11,13 +11,9 @@ from pathlib import Path
 
 import yaml
 
-from paul_ros.skeleton import Layout
-from training.view_settings import Views, ViewsError
-
-
-class RecipeError(ValueError):
-    """A recipe that cannot be used; the text says what to do."""
-
+from paul_ros.layout import Layout
+from training.errors import RecipeError, ViewsError
+from training.people.view_settings import Views
 
 #: Settings that are one of a few words.
 CHOICES = {

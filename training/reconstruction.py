@@ -14,14 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from paul_ros.files import NpzError, read_npz, write_atomically
-from training.data import DataError, TrainingData, check_sizes
+from paul_ros.errors import NpzError
+from paul_ros.files import read_npz, write_atomically
+from training.data import TrainingData, check_sizes
 from training.distributed import processes
+from training.errors import DataError, TrainingError
 from training.objective import Views, fit, paul_terms
 from training.recipe import Recipe
 from training.solver import centre
-from training.starting import START_UNIT, Progress
-from training.trainer import Trainer, TrainingError
+from training.start.kept_start import START_UNIT, Progress
+from training.trainer import Trainer
 
 _BATCH = 256
 _START_SHARE = 0.3  # of the work, as progress tells it

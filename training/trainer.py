@@ -24,15 +24,16 @@ import torch
 from torch import Tensor, nn
 
 from paul_ros.files import write_atomically
+from paul_ros.layout import Layout
 from paul_ros.model import enough_visible
-from paul_ros.skeleton import Layout
-from training import starting
 from training.data import TrainingData
 from training.distributed import Share, from_first, is_first, processes, share_of
+from training.errors import StartError, TrainingError
 from training.networks import Paul, build_networks, main_axes
 from training.objective import Terms, Views, fit, paul_terms, regression_terms
 from training.recipe import Recipe
-from training.starting import START_UNIT, Lesson, Progress, Start, StartError, kept_start, start_identity
+from training.start import kept_start as starting
+from training.start.kept_start import START_UNIT, Lesson, Progress, Start, kept_start, start_identity
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
 LOG_COLUMNS = (
@@ -50,10 +51,6 @@ _CHECKPOINT_SECONDS = 30.0
 _WARM_UP_STEPS = 200
 _GRADIENT_LIMIT = 1.0  # per square root of the number of points, as the objective grows with it
 _SETTLED = 1e-3
-
-
-class TrainingError(RuntimeError):
-    """Training cannot go on; the text says what to do."""
 
 
 @contextmanager

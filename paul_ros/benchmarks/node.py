@@ -25,11 +25,12 @@ from typing import Any
 import numpy as np
 
 from msg_adapters import outputs, read
-from paul_ros.bag import BagMessages, read_records
 from paul_ros.benchmarks.traffic import ARRIVAL, NODES
-from paul_ros.demo import find_bag
-from paul_ros.processes import need_ros, process, ros_environment, rss_mb, tail
-from paul_ros.replay import versions
+from paul_ros.errors import NodeBenchmarkError
+from paul_ros.offline.bag import BagMessages, read_records
+from paul_ros.offline.demo import find_bag
+from paul_ros.offline.processes import need_ros, process, ros_environment, rss_mb, tail
+from paul_ros.offline.replay import versions
 
 STARTS = 3
 """Of each node, for the time from its start to its first output."""
@@ -38,7 +39,7 @@ SLICE_SECONDS = 2.0
 SOAK_SECONDS = 10.0
 """Memory is read so often in a long run."""
 
-_MODULES = {"lifter": "paul_ros.node", "echo": "paul_ros.benchmarks.echo"}
+_MODULES = {"lifter": "paul_ros.ros.node", "echo": "paul_ros.benchmarks.echo"}
 _POINTS = 17
 _IMAGE = 1280, 720  # pixels; that of the recording
 _FILLED = 0.8  # of its cell, by a person
@@ -49,14 +50,6 @@ _PATIENCE = 30.0  # seconds for a process to answer
 _SILENCE = 1.0  # seconds without an answer after which no more is expected
 _US = 1e6
 _FRAME = "camera_color_optical_frame"
-
-
-class NodeBenchmarkError(Exception):
-    """The benchmark could not run; str() is one line for the user."""
-
-
-ERRORS = (NodeBenchmarkError,)
-"""What a user can cause."""
 
 
 def run(persons: list[int], rates: list[int], seconds: float) -> dict:

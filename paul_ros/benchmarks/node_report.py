@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from paul_ros.benchmarks import need
+from paul_ros.errors import PictureError
 from paul_ros.files import write_atomically
-from paul_ros.report import PictureError
 
 _COLOURS = {"lifter": "#1f77d0", "echo": "#8a8a8a"}
 _LEAST_US = 100  # of the pictures' axes

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from paul_ros.benchmarks import need
+from paul_ros.errors import PictureError
 from paul_ros.files import write_atomically
-from paul_ros.report import PictureError
 
 _COLOURS = {"ours": "#111111", "lsq_svd": "#e4572e", "polar": "#f0a030", "majorise": "#1f77d0", "lm_search": "#2a9d50"}
 _LEAST_ANGLE = 1e-3  # degrees: what is shown of less

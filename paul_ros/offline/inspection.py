@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a model file, a bag or a layout holds, as one summary for people and for JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from paul_ros.errors import BagError
+from paul_ros.layout import Layout, layout_names, load_layout
+from paul_ros.model import load_model, model_names
+from paul_ros.offline.bag import read_records
+
+
+def inspect(thing: str) -> tuple[dict, BagError | None]:
+    """The summary of a model, bag or layout, given by name or path; with a damaged bag also what is wrong with it.
+
+    Of a shipped model whose name a layout has too, as `human`, the layout's stands in the model's.
+    Raises BagError, LayoutError or ModelError.
+    """
+    path = Path(thing)
+    if path.is_dir() or path.suffix in (".mcap", ".part"):
+        return _bag(path)
+    if thing in model_names():
+        same_name = {"layout_of_this_name": _layout(load_layout(thing))} if thing in layout_names() else {}
+        return {**_model(thing), **same_name}, None
+    if thing in layout_names() or path.suffix in (".yaml", ".yml"):
+        return _layout(load_layout(thing)), None
+    return _model(thing), None
+
+
+def _bag(path: Path) -> tuple[dict, BagError | None]:
+    topics: dict[str, dict] = {}
+    times: dict[str, list[int]] = {}
+    damage = None
+    try:
+        for record in read_records(path):
+            topics.setdefault(record.topic, {"type": record.type_name})
+            times.setdefault(record.topic, []).append(record.log_time)
+    except BagError as error:
+        if not topics:
+            raise
+        damage = error
+    for topic, stamps in times.items():
+        seconds = (max(stamps) - min(stamps)) / 1e9
+        topics[topic].update(messages=len(stamps), rate_hz=(len(stamps) - 1) / seconds if seconds else None)
+    everything = [stamp for stamps in times.values() for stamp in stamps]
+    seconds = (max(everything) - min(everything)) / 1e9 if everything else 0.0
+    return {
+        "kind": "bag",
+        "path": str(path),
+        "duration_s": seconds,
+        "messages": len(everything),
+        "topics": topics,
+        "damage": str(damage) if damage else None,
+    }, damage
+
+
+def _layout(layout: Layout) -> dict:
+    return {"kind": "layout", "points": len(layout.names), **layout.to_dict()}
+
+
+def _model(thing: str) -> dict:
+    model = load_model(thing)
+    header = {key: value for key, value in model.header.items() if key != "layout"}
+    return {
+        "kind": "model",
+        "name": model.name,
+        "layout": model.layout.name,
+        "points": len(model.layout.names),
+        "least_points_to_lift": model.min_visible,
+        "sha256": model.sha256,
+        **header,
+    }
+
+
+def as_text(summary: dict) -> str:
+    """`key  value` lines; what is nested is indented, long lists are wrapped by the terminal."""
+    return "\n".join(_lines(summary, ""))
+
+
+def _lines(value: dict, indent: str) -> list[str]:
+    width = max((len(str(key)) for key in value), default=0) + 2
+    lines = []
+    for key, item in value.items():
+        if isinstance(item, dict) and item:
+            lines += [f"{indent}{key}", *_lines(item, indent + "  ")]
+        else:
+            lines.append(f"{indent}{key:<{width}}{_brief(item)}")
+    return lines
+
+
+def _brief(item: object) -> str:
+    if item is None:
+        return "-"
+    if isinstance(item, float):
+        return f"{item:.6g}"
+    if isinstance(item, (list, tuple)):
+        return ", ".join("-".join(map(str, part)) if isinstance(part, (list, tuple)) else str(part) for part in item)
+    return " ".join(str(item).split())

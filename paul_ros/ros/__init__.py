@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ROS 2 node `lifter`: thin shells over `paul_ros.stream`; the only place that imports rclpy."""

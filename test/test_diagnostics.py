@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Levels, rates, latency and shares of /diagnostics; what is said aloud, and how often."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from paul_ros.ros.diagnostics import ERROR, OK, STALE, STALE_SECONDS, WARN, Aloud, Health, percentiles
+from paul_ros.stream.stream import open_stream
+
+S = 10**9  # ns
+
+
+@pytest.fixture
+def stream(model_file):
+    stream = open_stream(str(model_file))
+    stream.intrinsics = SimpleNamespace(matrix="K", distorted=False)
+    return stream
+
+
+@pytest.fixture
+def health():
+    return Health(100.0)
+
+
+def frame(stamp: int = 0, certified=(True,), ambiguity=(0.5,)):
+    """What Health looks at of a lifted frame."""
+    lifted = SimpleNamespace(certified=np.array(certified, bool), ambiguity=np.array(ambiguity, float))
+    return SimpleNamespace(keypoints=SimpleNamespace(stamp=stamp), lifted=lifted)
+
+
+def run(health, now: float = 101.0) -> None:
+    """One good frame."""
+    health.came(now - 0.5)
+    health.went(frame(), S)
+
+
+def test_all_is_well(health, stream):
+    run(health)
+    report = health.report(101.0, stream)
+    assert (report.level, report.message) == (OK, "1 frames since the last report, units: m")
+    assert report.frames == 1 and report.waited == pytest.approx(0.5)
+
+
+def test_nothing_yet_then_silence_then_stale(health, stream):
+    assert health.report(101.0, stream).level == WARN
+    never = health.report(102.0, stream)
+    assert "no keypoints yet" in never.message and never.waited == 2
+    run(health, 103.0)
+    assert health.report(103.0, stream).level == OK
+    quiet = health.report(104.0, stream)
+    assert quiet.level == WARN and "no keypoints since" in quiet.message
+    assert health.report(102.5 + STALE_SECONDS - 0.01, stream).level == WARN
+    stale = health.report(102.5 + STALE_SECONDS, stream)
+    assert stale.level == STALE and "no keypoints for 5 s" in stale.message
+    assert stale.values["last_input_age_s"] == "5.0"
+
+
+def test_an_input_that_cannot_be_read_is_an_error(health, stream):
+    run(health)
+    report = health.report(101.0, stream, "no such package")
+    assert (report.level, report.message) == (ERROR, "no such package")
+
+
+def test_a_fault_of_the_node_is_an_error(health, stream):
+    run(health)
+    stream.drops["internal_error"] += 1
+    assert health.report(101.0, stream).level == ERROR
+    run(health, 102.0)
+    assert health.report(102.0, stream).level == OK
+
+
+def test_drops_are_a_warning_and_an_error_where_nothing_is_left(health, stream):
+    run(health)
+    health.came(100.9)
+    stream.drops["wrong_fields"] += 1
+    report = health.report(101.0, stream)
+    assert report.level == WARN and "dropped: 1 wrong_fields" in report.message
+    health.came(101.5)
+    stream.drops["wrong_fields"] += 1
+    report = health.report(102.0, stream)
+    assert report.level == ERROR and "could be used; dropped: 1 wrong_fields" in report.message
+    assert report.values["dropped_wrong_fields"] == 2
+
+
+def test_drops_of_before_it_was_activated_are_old_news(stream):
+    stream.drops.update(internal_error=2, not_2d=3)
+    health = Health(100.0, stream.drops)
+    run(health)
+    report = health.report(101.0, stream)
+    assert report.level == OK and report.values["dropped_not_2d"] == 3
+    stream.drops["not_2d"] += 1
+    assert "dropped: 1 not_2d" in health.report(102.0, stream).message
+
+
+def test_what_is_odd_but_lifted_is_a_warning_as_long_as_it_lasts(stream):
+    stream.notes.update(another_frame=4, unlike_the_model=9)
+    stream.explanations.update(another_frame="another frame", unlike_the_model="hardly those")
+    health = Health(100.0, stream.drops, stream.notes)
+    run(health)
+    assert health.report(101.0, stream).level == OK
+    run(health, 102.0)
+    run(health, 102.5)
+    stream.notes["unlike_the_model"] += 1
+    assert health.report(103.0, stream).level == OK, "half of the persons may be odd, as some detections are"
+    run(health, 104.0)
+    stream.notes.update(another_frame=1, unlike_the_model=1)
+    report = health.report(104.0, stream)
+    assert report.level == WARN and report.message.startswith("another frame; hardly those; 1 frames")
+
+
+def test_a_person_left_out_or_a_message_lost_is_no_error(health, stream):
+    health.came(100.5)  # and waits for the rest of its image
+    stream.drops["missed"] += 3
+    stream.drops["person_too_few_points"] += 2
+    assert health.report(101.0, stream).level == WARN
+
+
+def test_a_qos_that_does_not_match_is_a_warning_once(health, stream):
+    run(health)
+    health.mismatch()
+    report = health.report(101.0, stream)
+    assert report.level == WARN and "QoS" in report.message
+    run(health, 102.0)
+    assert health.report(102.0, stream).level == OK
+
+
+def test_model_units_are_a_warning_where_the_model_knows_metres(health, stream):
+    stream.intrinsics = None
+    run(health)
+    report = health.report(101.0, stream)
+    assert report.level == WARN and "no metres" in report.message
+    stream.lifter.metres_per_unit = None
+    run(health, 102.0)
+    assert health.report(102.0, stream).level == OK
+
+
+def test_rates_are_of_the_time_since_the_last_report(health, stream):
+    for _ in range(30):
+        health.came(100.1)
+    for _ in range(20):
+        health.went(frame(), S)
+    values = health.report(102.0, stream).values
+    assert (values["rate_in_hz"], values["rate_out_hz"]) == ("15.0", "10.0")
+    values = health.report(103.0, stream).values
+    assert (values["rate_in_hz"], values["rate_out_hz"]) == ("0.0", "0.0")
+
+
+def test_latency_is_told_where_the_clocks_agree(health, stream):
+    health.went(frame(stamp=50 * S), 3 * S)  # from the future
+    health.went(frame(stamp=0), 1_700_000_000 * S)  # a bag of long ago
+    values = health.report(101.0, stream).values
+    assert values["latency_ms_median"] == values["latency_ms_p99"] == "unknown"
+    for ms in range(1, 102):
+        health.went(frame(stamp=S), S + ms * 10**6)
+    values = health.report(102.0, stream).values
+    assert (values["latency_ms_median"], values["latency_ms_p99"]) == ("51.00", "100.00")
+    health.forget_latency()
+    assert health.report(103.0, stream).values["latency_ms_median"] == "unknown"
+
+
+def test_shares_are_of_the_persons_lifted(health, stream):
+    health.went(frame(certified=(True, False, False), ambiguity=(0.95, 0.2, np.nan)), S)
+    health.went(frame(certified=(True, True), ambiguity=(0.1, 0.0)), S)
+    health.went(frame(certified=(), ambiguity=()), S)
+    values = health.report(101.0, stream).values
+    assert (values["certified_share"], values["ambiguous_share"]) == ("0.750", "0.250")
+    assert health.report(102.0, stream).values["certified_share"] == "none"
+
+
+def test_model_and_layouts_are_told(health, stream):
+    values = health.report(101.0, stream, source="a/msg/B").values
+    assert (values["model"], len(values["model_sha256"]), values["input_type"]) == ("stand", 64, "a/msg/B")
+    assert (values["input_layout"], values["layout"]) == (None, "coco17")
+
+
+def test_percentiles_of_nothing():
+    assert percentiles([]) is None and percentiles([3.0]) == (3.0, 3.0)
+
+
+def test_the_same_is_said_again_only_after_a_while(monkeypatch):
+    said, now = [], [0.0]
+    monkeypatch.setattr("paul_ros.ros.diagnostics.time.monotonic", lambda: now[0])
+    aloud = Aloud(said.append, every=5.0)
+    aloud.hold("b")
+    for now[0] in (0.0, 4.9, 5.0, 9.9, 10.0):
+        aloud("a", "a")
+        aloud("b", "b", every=7.0)
+    assert said == ["a", "a", "b", "a"]

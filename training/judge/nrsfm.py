@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`paul benchmark nrsfm`: the paper's table of normalised errors, measured, beside the published one."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from paul_ros.offline.replay import versions
+from training.errors import DataError
+from training.judge.experiments import BAD_BASIN, Keeping, Outcome, Run, chosen, groups, perform, summary
+from training.judge.pictures import legend_above, method_look, new_figure, percent_axis, save_figure, titled
+from training.judge.published import REMARK, SOURCE, published
+from training.judge.truth import Sequence, load_sequence
+
+METHODS = ("paul", "adl", "adl_low_rank", "linear", "rigid")
+
+_RIVAL_MARKERS = {"CNS": "s", "PND": "^", "BMM": "v", "BMM-v2": "D", "Deep NRSfM": "*"}
+
+_STARTS = ("linear", "rigid")
+_TRAINING = ("start", "regression_steps", "steps")
+"""Settings that would make something else of a start that is a method of its own."""
+
+
+def find_sequences(folder: Path, names: list[str] | None = None) -> list[Sequence]:
+    """The npz files of a folder that hold W and S, all or the named ones; others are told of on stderr.
+
+    Raises:
+        DataError: no such folder, no such sequence, or none at all.
+    """
+    files = {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    if not files:
+        raise DataError(f"no npz files in '{folder}': name a folder of sequences with W and S")
+    missing = [name for name in names or () if name not in files]
+    if missing:
+        raise DataError(f"no sequence {', '.join(missing)} in '{folder}'; there are {', '.join(files)}")
+    if names:
+        return [load_sequence(files[name]) for name in names]
+    found = []
+    for path in files.values():
+        try:
+            found.append(load_sequence(path))
+        except DataError as error:
+            print(f"left out: {error}", file=sys.stderr)
+    if not found:
+        raise DataError(f"no npz file in '{folder}' has both W and the truth S")
+    return found
+
+
+def plan(sequences: list[Sequence], methods: list[str], seeds: int, hide: float, settings: list[str]) -> list[Run]:
+    """All runs, sequence by sequence; each seed hides other points."""
+    return [
+        Run(sequence.hiding(hide, seed) if hide else sequence, method, seed, _fitting(method, settings))
+        for sequence in sequences
+        for method in methods
+        for seed in range(seeds)
+    ]
+
+
+def _fitting(method: str, settings: list[str]) -> tuple[str, ...]:
+    """The overrides under which a method still is what its name says."""
+    refused = _TRAINING if method in _STARTS else ()
+    return tuple(setting for setting in settings if setting.partition("=")[0].strip() not in refused)
+
+
+def _tell_of_left_out(methods: list[str], settings: list[str]) -> None:
+    for method in methods:
+        fitting = _fitting(method, settings)
+        if left_out := [setting for setting in settings if setting not in fitting]:
+            print(f"{method}: {', '.join(left_out)} left out, for it is the start alone", file=sys.stderr)
+
+
+def run(
+    folder: Path,
+    *,
+    sequences: list[str] | None,
+    methods: list[str],
+    seeds: int,
+    hide: float,
+    settings: list[str],
+    keeping: Keeping,
+) -> dict:
+    """Train what is not there yet, and judge; the report is what `--json` writes.
+
+    Raises: see ``find_sequences`` and ``training.judge.experiments.perform``.
+    """
+    found = find_sequences(folder, sequences)
+    _tell_of_left_out(methods, settings)
+    outcomes = perform(plan(found, methods, seeds, hide, settings), keeping)
+    return report(outcomes) | {"hidden_share": hide, "settings": settings, "versions": versions()}
+
+
+def report(outcomes: list[Outcome]) -> dict:
+    """Rows of all runs, what they come down to, and what is published."""
+    series = groups(outcomes, lambda outcome: (outcome.run.sequence.name, outcome.run.method))
+    picks = {id(chosen(some)) for some in series.values()}
+    names = dict.fromkeys(outcome.run.sequence.name for outcome in outcomes)
+    return {
+        "rows": [_row(outcome, id(outcome) in picks) for outcome in outcomes],
+        "summary": [{"sequence": key[0], "method": key[1], **summary(some)} for key, some in series.items()],
+        "published_ne_percent": {name: published(name) for name in names},
+        "published_source": SOURCE,
+    }
+
+
+def _row(outcome: Outcome, is_chosen: bool) -> dict:
+    return {
+        "sequence": outcome.run.sequence.name,
+        "method": outcome.run.method,
+        "seed": outcome.run.seed,
+        "ne_flip_frame_percent": outcome.ne_flip_frame_percent,
+        "ne_flip_global_percent": outcome.ne_flip_global_percent,
+        "loss": outcome.loss,
+        "seconds": outcome.seconds,
+        "chosen": is_chosen,
+    }
+
+
+_COLUMNS = ("chosen", "median", "best", "worst")
+
+
+def table(report: dict) -> str:
+    """The paper's table and ours, sequence by sequence."""
+    head = (
+        f"{'sequence':<12} {'method':<14}" + "".join(f"{name:>17}" for name in _COLUMNS) + f"{'bad':>8}{'seconds':>9}"
+    )
+    hidden = f", {report['hidden_share']:.0%} of the points hidden" if report.get("hidden_share") else ""
+    lines = [f"normalised error in %, depth flip per frame / one flip for all{hidden}", head]
+    last = None
+    for row in report["summary"]:
+        name = row["sequence"]
+        if last is not None and name != last:
+            lines += _published_lines(report, last)
+        lines.append(f"{name if name != last else '':<12} {Path(row['method']).stem:<14}" + _cells(row))
+        last = name
+    lines += _published_lines(report, last)
+    return "\n".join(
+        [
+            *lines,
+            "chosen: the seed with the lowest loss, no truth looked at; bad: runs whose NE with one flip is above "
+            f"{BAD_BASIN:g} times the median",
+            f"published: {report['published_source']}; {REMARK}",
+        ]
+    )
+
+
+def _cells(row: dict) -> str:
+    pairs = (
+        f"{row[f'{name}_ne_flip_frame_percent']:>8.2f} /{row[f'{name}_ne_flip_global_percent']:>7.2f}"
+        for name in _COLUMNS
+    )
+    bad = f"{round(row['bad_basin_share'] * row['runs'])}/{row['runs']}"
+    return "".join(pairs) + f"{bad:>8}{row['seconds_median']:>9.0f}"
+
+
+def _published_lines(report: dict, name: str) -> list[str]:
+    figures = report["published_ne_percent"].get(name)
+    if not figures:
+        return [""]
+    return [f"{'':<13}published: " + ", ".join(f"{method} {value:.2f}" for method, value in figures.items()), ""]
+
+
+def write_picture(path: Path, report: dict) -> None:
+    """A dot a run, filled the chosen one, a bar at the median; black lines are the paper's PAUL, grey marks its rivals.
+
+    Raises ImportError without matplotlib, PictureError for an odd suffix.
+    """
+    names = list(report["published_ne_percent"])
+    methods = list(dict.fromkeys(row["method"] for row in report["rows"]))
+    figure = new_figure(max(7.0, 2.0 + 1.0 * len(names) + 0.25 * len(names) * len(methods)), 5.5)
+    ax = figure.subplots()
+    step = 0.76 / len(methods)
+    for place, method in enumerate(methods):
+        for middle, name in enumerate(names):
+            rows = [row for row in report["rows"] if (row["sequence"], row["method"]) == (name, method)]
+            x = middle - 0.38 + step * (place + 0.5)
+            _draw_runs(ax, x, 0.36 * step, rows, method)
+    for middle, figures in enumerate(report["published_ne_percent"].values()):
+        _draw_published(ax, middle, figures)
+    ax.set_xticks(range(len(names)), names)
+    ax.set_xlim(-0.55, len(names) - 0.4)
+    percent_axis(ax, "normalised error, flip per frame, %")
+    titled(ax, "Every run; filled: chosen without truth, bar: median;\nblack line and grey marks: published")
+    legend_above(figure, ax)
+    save_figure(figure, path)
+
+
+def _draw_runs(ax: Any, x: float, half: float, rows: list[dict], method: str) -> None:
+    name, colour = method_look(method)
+    errors = np.array([row["ne_flip_frame_percent"] for row in rows])
+    face = [colour if row["chosen"] else "white" for row in rows]
+    ax.hlines(np.median(errors), x - half, x + half, color=colour, linewidth=2.5, label=name)
+    spread = np.linspace(-0.6, 0.6, len(rows)) * half if len(rows) > 1 else np.zeros(1)
+    ax.scatter(x + spread, errors, s=30, facecolors=face, edgecolors=colour, linewidths=1.3, zorder=3)
+
+
+def _draw_published(ax: Any, middle: int, figures: dict[str, float]) -> None:
+    for name, value in figures.items():
+        if name == "PAUL":
+            line = dict(color="black", linewidth=1, label="PAUL, published", zorder=1)
+            ax.hlines(value, middle - 0.42, middle + 0.42, **line)
+        else:
+            mark = dict(marker=_RIVAL_MARKERS[name], s=22, facecolors="none", edgecolors="#707070", linewidths=1)
+            ax.scatter(middle + 0.44, value, label=name, **mark)

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The error against one thing that is varied: bottleneck, noise of the points, share of hidden points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from training.judge.experiments import Outcome, Run, chosen, groups, summary
+from training.judge.pictures import COLOURS, legend_above, new_figure, percent_axis, titled
+from training.judge.studies.study import Study
+from training.judge.truth import Sequence
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is varied.
+
+    Attributes:
+        name: of the study.
+        axis: what values are called.
+        values: tried by default.
+        vary: the run for a sequence, value, seed and overrides.
+        reference: what ratios are to, for people.
+        against_best: that is the best value, else value 0.
+        percent: values are shares.
+    """
+
+    name: str
+    axis: str
+    values: tuple[float, ...]
+    vary: Callable[[Sequence, float, int, tuple[str, ...]], Run]
+    reference: str
+    against_best: bool = False
+    percent: bool = False
+
+    def runs(self, sequences: list[Sequence], seeds: int, values: tuple, settings: tuple[str, ...]) -> list[Run]:
+        """Every value of every sequence, as often as there are seeds."""
+        return [
+            self.vary(sequence, value, seed, settings)
+            for sequence in sequences
+            for value in values
+            for seed in range(seeds)
+        ]
+
+    def shown(self, value: float) -> str:
+        """A value, for people."""
+        return f"{100 * value:g} %" if self.percent else f"{value:g}"
+
+    def report(self, outcomes: list[Outcome]) -> dict:
+        """A row a run, and a line of summary for each sequence and value."""
+        series = groups(outcomes, lambda outcome: (outcome.run.sequence.name, outcome.run.value))
+        picks = {id(chosen(some)) for some in series.values()}
+        lines = [{"sequence": name, "value": value, **summary(some)} for (name, value), some in series.items()]
+        for line in lines:
+            line["ratio"] = self._ratio(line, [other for other in lines if other["sequence"] == line["sequence"]])
+        return {
+            "axis": self.axis,
+            "rows": [
+                {
+                    "sequence": outcome.run.sequence.name,
+                    "value": outcome.run.value,
+                    "seed": outcome.run.seed,
+                    "ne_flip_frame_percent": outcome.ne_flip_frame_percent,
+                    "ne_flip_global_percent": outcome.ne_flip_global_percent,
+                    "loss": outcome.loss,
+                    "seconds": outcome.seconds,
+                    "chosen": id(outcome) in picks,
+                }
+                for outcome in outcomes
+            ],
+            "summary": lines,
+        }
+
+    def _ratio(self, line: dict, others: list[dict]) -> float | None:
+        """Of the median error to that of the best value or of value 0."""
+        key = "median_ne_flip_global_percent"
+        found = [other[key] for other in others if self.against_best or other["value"] == 0]
+        return line[key] / min(found) if found and min(found) > 0 else None
+
+    def table(self, report: dict) -> str:
+        """A line for each sequence and value."""
+        head = (
+            f"{'sequence':<12}{self.axis:>24}{'mean':>9}{'deviation':>11}{'median':>9}{'best':>8}{'worst':>8}{'bad':>7}"
+            f"{'one flip':>10}{'ratio':>7}{'seconds':>9}"
+        )
+        lines, last = [head], None
+        for row in report["summary"]:
+            name = row["sequence"] if row["sequence"] != last else ""
+            last = row["sequence"]
+            mean, deviation, median, best, worst = (
+                row[f"{key}_ne_flip_frame_percent"] for key in ("mean", "deviation", "median", "best", "worst")
+            )
+            bad = f"{round(row['bad_basin_share'] * row['runs'])}/{row['runs']}"
+            ratio = "-" if row["ratio"] is None else f"{row['ratio']:.2f}"
+            lines.append(
+                f"{name:<12}{self.shown(row['value']):>24}{mean:>9.2f}{deviation:>11.2f}{median:>9.2f}{best:>8.2f}"
+                f"{worst:>8.2f}{bad:>7}{row['median_ne_flip_global_percent']:>10.2f}{ratio:>7}"
+                f"{row['seconds_median']:>9.0f}"
+            )
+        return "\n".join(
+            [
+                f"normalised error in % over {report['summary'][0]['runs']} seeds, depth flip per frame",
+                *lines,
+                "one flip: the median with one flip for all frames; bad: runs above three times that; "
+                f"ratio: that median over that of {self.reference}",
+            ]
+        )
+
+    def draw(self, outcomes: list[Outcome], report: dict) -> Any:
+        """A line a sequence: the mean over runs, its deviation as a band, runs as faint dots (the paper's figure 5).
+
+        The mean with one flip for all is dashed: where it is higher, the runs mix a shape and its mirror image.
+        """
+        figure = new_figure(7.5, 5)
+        ax = figure.subplots()
+        factor = 100 if self.percent else 1
+        series = groups(report["summary"], lambda line: line["sequence"])
+        for colour, (name, lines) in zip(COLOURS * len(series), series.items()):
+            rows = [row for row in report["rows"] if row["sequence"] == name]
+            at = [factor * row["value"] for row in rows]
+            ax.scatter(at, [row["ne_flip_frame_percent"] for row in rows], s=9, color=colour, alpha=0.45, linewidths=0)
+            _draw_line(ax, lines, factor, name, colour)
+        ax.plot([], [], color="#444444", linestyle="--", linewidth=1.2, label="one flip for all, where it differs")
+        ax.set_xticks(sorted({factor * line["value"] for line in report["summary"]}))
+        ax.set_xlabel(f"{self.axis}{', %' if self.percent else ''}")
+        percent_axis(ax, "normalised error, %")
+        titled(ax, f"Flip per frame: mean and standard deviation over {report['summary'][0]['runs']} runs")
+        legend_above(figure, ax)
+        return figure
+
+    def study(self) -> Study:
+        """As a study."""
+        return Study(self.name, self.runs, self.report, self.table, self.draw, self.values)
+
+
+def _draw_line(ax: Any, lines: list[dict], factor: float, name: str, colour: str) -> None:
+    x = np.array([factor * line["value"] for line in lines])
+    mean, deviation, best, one_flip = (
+        np.array([line[f"{key}_percent"] for line in lines])
+        for key in ("mean_ne_flip_frame", "deviation_ne_flip_frame", "best_ne_flip_frame", "mean_ne_flip_global")
+    )
+    low = np.maximum(mean - deviation, best)  # an axis of decades knows no zero
+    ax.fill_between(x, low, mean + deviation, color=colour, alpha=0.18, linewidth=0)
+    ax.plot(x, one_flip, color=colour, linewidth=1.2, linestyle="--")
+    ax.plot(x, mean, color=colour, linewidth=2, marker="o", markersize=4, label=name)
+
+
+def _bottleneck(sequence: Sequence, K: float, seed: int, settings: tuple[str, ...]) -> Run:
+    return Run(sequence, "paul", seed, (*settings, f"bottleneck={K:g}"), f"K = {K:g}", K)
+
+
+def _noise(sequence: Sequence, share: float, seed: int, settings: tuple[str, ...]) -> Run:
+    return Run(sequence.noisy(share, seed), "paul", seed, settings, f"noise {100 * share:g} %", share)
+
+
+def _hidden(sequence: Sequence, share: float, seed: int, settings: tuple[str, ...]) -> Run:
+    return Run(sequence.hiding(share, seed), "paul", seed, settings, f"hidden {100 * share:g} %", share)
+
+
+STUDIES = tuple(
+    sweep.study()
+    for sweep in (
+        Sweep("bottleneck", "bottleneck K", tuple(range(2, 13)), _bottleneck, "the best K", against_best=True),
+        Sweep("noise", "noise, of rms coordinate", (0.0, 0.01, 0.02, 0.05, 0.1), _noise, "no noise", percent=True),
+        Sweep("hidden", "hidden points", (0.0, 0.3, 0.6), _hidden, "all points seen", percent=True),
+    )
+)

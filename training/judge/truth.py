@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""2D keypoints beside their 3D truth: what is judged with, and what the trainer never sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from paul_ros.errors import NpzError
+from paul_ros.files import read_npz
+from training.errors import DataError
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """F frames of P points; frames may come in any order, the trainer is given them shuffled.
+
+    Attributes:
+        name: file name without suffix.
+        W: (F,2,P) image points, float32 or float64, y down; 0 where hidden.
+        visible: (F,P) bool.
+        S: (F,3,P) truth in the camera frame and the unit of W, float32 or float64; NaN where it is not known.
+        edges: (E,2) points to draw lines between, may be empty. For pictures only.
+        metres: S is in metres.
+    """
+
+    name: str
+    W: np.ndarray
+    visible: np.ndarray
+    S: np.ndarray
+    edges: np.ndarray
+    metres: bool
+
+    @property
+    def present(self) -> np.ndarray:
+        """(F,P) bool: the truth of the point is known."""
+        return np.isfinite(self.S).all(1)
+
+    def hiding(self, share: float, seed: int) -> Sequence:
+        """The same with that share of every frame's points hidden at random, one number of points in every frame."""
+        drawn = np.where(self.visible, np.random.default_rng([seed, 1]).random(self.visible.shape), 2.0)
+        order = drawn.argsort(1).argsort(1)
+        count = np.round(share * self.visible.sum(1)).astype(int)
+        visible = self.visible & (order >= count[:, None])
+        return replace(self, visible=visible, W=np.where(visible[:, None], self.W, 0.0))
+
+    def noisy(self, share: float, seed: int) -> Sequence:
+        """The same with Gaussian noise on W, its deviation that share of the rms coordinate; the truth stays clean."""
+        seen = self.visible[:, None]
+        count = np.maximum(self.visible.sum(1), 1)[:, None, None]
+        offset = np.where(seen, self.W - self.W.sum(2, keepdims=True) / count, 0.0)
+        rms = np.sqrt((offset**2).sum() / (2 * self.visible.sum()))
+        noise = np.random.default_rng([seed, 2]).standard_normal(self.W.shape)
+        return replace(self, W=np.where(seen, self.W + share * rms * noise, 0.0))
+
+    def from_random_cameras(self, seed: int) -> Sequence:
+        """The same shapes, each seen by an orthographic camera of its own random rotation; needs the whole truth.
+
+        Raises:
+            DataError: the truth of some points is not known.
+        """
+        if not self.present.all():
+            raise DataError(f"'{self.name}' cannot be seen from other sides: the truth S of some points is not known")
+        S = random_rotations(len(self.S), seed) @ (self.S - self.S.mean(2, keepdims=True))
+        return replace(self, W=np.where(self.visible[:, None], S[:, :2], 0.0), S=S)
+
+
+def random_rotations(count: int, seed: int) -> np.ndarray:
+    """Rotations (count,3,3), det +1, uniform over all orientations."""
+    Q, triangle = np.linalg.qr(np.random.default_rng([seed, 3]).standard_normal((count, 3, 3)))
+    Q = Q * np.sign(np.diagonal(triangle, axis1=1, axis2=2))[:, None]
+    Q[:, :, 0] *= np.linalg.det(Q)[:, None]
+    return Q
+
+
+def load_sequence(path: str | Path) -> Sequence:
+    """Read an npz with W (F,2,P) and the truth S (F,3,P), and optionally visible (F,P), edges (E,2), metres (one bool).
+
+    Raises:
+        DataError: no such file, damage, a missing array, or arrays that do not fit together.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"no data file '{path}'")
+    try:
+        arrays = read_npz(path, ("W", "S"), ("visible", "edges", "metres"))
+    except NpzError as error:
+        raise DataError(f"'{path}' {error} (judging needs W (F,2,P) and the truth S (F,3,P))") from error
+    for name, rows in (("W", 2), ("S", 3)):
+        if arrays[name].ndim != 3 or arrays[name].shape[1] != rows or arrays[name].dtype.kind not in "fiu":
+            raise DataError(
+                f"{name} in '{path}' must be numbers (F,{rows},P), it is {arrays[name].dtype} {arrays[name].shape}"
+            )
+    return _sequence(path, **arrays)
+
+
+def _sequence(
+    path: Path,
+    W: np.ndarray,
+    S: np.ndarray,
+    visible: np.ndarray | None = None,
+    edges: np.ndarray | None = None,
+    metres: np.ndarray | None = None,
+) -> Sequence:
+    frames, points = len(W), W.shape[2]
+    if S.shape != (frames, 3, points) or not frames:
+        raise DataError(f"W {W.shape} and S {S.shape} in '{path}' must have the same frames and points, at least one")
+    visible = np.ones((frames, points), bool) if visible is None else visible
+    if visible.shape != (frames, points) or not np.isin(visible, (0, 1)).all():
+        raise DataError(f"visible in '{path}' must be {(frames, points)} of bool (or 0 and 1), it is {visible.shape}")
+    visible = visible.astype(bool) & np.isfinite(W).all(1)
+    if not np.isfinite(S).any():
+        raise DataError(f"the truth S in '{path}' holds no number")
+    edges = np.zeros((0, 2), int) if edges is None else edges
+    if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu" or not _within(edges, points):
+        raise DataError(f"edges in '{path}' must be (E,2) indices of the {points} points")
+    return Sequence(
+        name=path.stem,
+        W=np.where(visible[:, None], W, 0).astype(_floating(W)),
+        visible=visible,
+        S=S.astype(_floating(S), copy=False),
+        edges=edges,
+        metres=metres is not None and metres.size == 1 and bool(metres.all()),
+    )
+
+
+def _floating(array: np.ndarray) -> type:
+    """Single precision stays what it is: dense truth fills memory."""
+    return np.float32 if array.dtype == np.float32 else np.float64
+
+
+def _within(edges: np.ndarray, points: int) -> bool:
+    return bool((edges >= 0).all() and (edges < points).all())
