@@ -20,7 +20,7 @@ $(VENV)/.package: $(VENV)/.dependencies $(SOURCES)
 $(VENV)/.dependencies: constraints.txt setup.cfg
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) setuptools wheel
-	$(PIP) --no-build-isolation ".[ros,train,bags,test]"
+	$(PIP) --no-build-isolation ".[ros,train,bags,docs,test]"
 	touch $@
 
 # What apt gives a robot on Ubuntu 24.04. NumPy 1.26 has no wheels for Python 3.13; its test is left out there.
@@ -35,6 +35,8 @@ test: setup $(VENV)/.robot
 
 lint: setup
 	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
 
 demo: setup
 	$(VENV)/bin/paul demo

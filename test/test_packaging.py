@@ -188,7 +188,7 @@ def test_package_xml_is_valid_and_says_what_the_code_needs() -> None:
     setup.read(ROOT / "setup.cfg")
     required = re.findall(r"^[\w-]+", setup["options"]["install_requires"], re.MULTILINE)
     assert {f"python3-{name.lower().removeprefix('py')}" for name in required} <= needed
-    node = "".join((ROOT / f"paul_ros/{name}.py").read_text(encoding="utf-8") for name in ("node", "ros"))
+    node = "".join(file.read_text(encoding="utf-8") for file in sorted((ROOT / "paul_ros/ros").glob("*.py")))
     writers = (ROOT / "msg_adapters/outputs.py").read_text(encoding="utf-8")
     imported = set(re.findall(r"^from (\w+)\.msg import", node, re.MULTILINE))
     made = set(re.findall(r'"(\w+)/msg/', writers))
