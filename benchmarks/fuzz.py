@@ -56,7 +56,7 @@ from paul_ros.errors import BagError, LayoutError, ModelError
 from paul_ros.files import write_atomically
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model, weight_shapes
+from paul_ros.model_file import load_model, weight_shapes
 from paul_ros.offline.bag import BagMessages, BagWriter, read_records
 from paul_ros.offline.replay import Topics, evaluate, replay
 from paul_ros.stream.stream import PACKED, LiftStream

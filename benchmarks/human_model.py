@@ -27,8 +27,9 @@ from msg_adapters import Intrinsics
 from paul_ros import metrics
 from paul_ros.files import write_atomically
 from paul_ros.layout import load_layout
-from paul_ros.lifter import Lifted, Lifter
-from paul_ros.model import DEFAULT_MODEL, load_model
+from paul_ros.lifted import Lifted
+from paul_ros.lifter import Lifter
+from paul_ros.model_file import DEFAULT_MODEL, load_model
 from training.judge.pictures import COLOURS, new_figure, save_figure, titled
 from training.people.human_data import HELD_OUT, Seen, read_clips, see
 from training.people.mocap import human_layout, human_points

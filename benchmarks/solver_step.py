@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from training.networks import build_networks
 from training.recipe import Recipe
 from training.solver import algebraic_camera, centre, solve_camera

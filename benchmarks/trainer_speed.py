@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from paul_ros.files import write_atomically
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from training.data import TrainingData
 from training.judge.truth import random_rotations
 from training.networks import build_networks

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from paul_ros import OnP, onp
+from paul_ros import viewing_goal as vg
 from paul_ros import viewing_sphere as vs
-from paul_ros.onp import OnP, onp
+from paul_ros.arithmetic import Arrays, Floats, Vector, map_tree
 
 HERE = Path(__file__).resolve().parent
 SCALES = ("free", "unit")
@@ -50,7 +52,7 @@ def random_problems(
     return S, R[:, :2] @ S + noise * rng.standard_normal((count, 2, points)), R
 
 
-def reduced(S: np.ndarray, W: np.ndarray) -> tuple[vs.Problem, np.ndarray]:
+def reduced(S: np.ndarray, W: np.ndarray) -> tuple[vg.Problem, np.ndarray]:
     """The problems in the principal axes of their shapes, normalised, and those axes (N,3,3) as columns."""
     S, W = S - S.mean(2, keepdims=True), W - W.mean(2, keepdims=True)
     size_S, size_W = np.linalg.norm(S, axis=(1, 2)), np.linalg.norm(W, axis=(1, 2))
@@ -58,16 +60,16 @@ def reduced(S: np.ndarray, W: np.ndarray) -> tuple[vs.Problem, np.ndarray]:
     V = V * np.linalg.det(V)[:, None, None]
     d = ((W[:, 0] + 1j * W[:, 1])[:, None] @ S.transpose(0, 2, 1) @ V)[:, 0] / (size_S * size_W)[:, None]
     c = np.cross(d.real, d.imag)
-    return vs.Problem(tuple((a / size_S[:, None] ** 2).T), tuple(d.T), tuple(c.T), size_S / (size_S + size_W)), V
+    return vg.Problem(tuple((a / size_S[:, None] ** 2).T), tuple(d.T), tuple(c.T), size_S / (size_S + size_W)), V
 
 
-def energies(problem: vs.Problem, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def energies(problem: vg.Problem, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """E and T of one problem in the directions n (...,3)."""
     a, d, c = (np.array(part) for part in problem[:3])
     return (n * n) @ a, (abs(d) ** 2).sum() - abs(n @ d) ** 2 + 2 * n @ c
 
 
-def goal(problem: vs.Problem, E: np.ndarray, T: np.ndarray, scale: str) -> np.ndarray:
+def goal(problem: vg.Problem, E: np.ndarray, T: np.ndarray, scale: str) -> np.ndarray:
     if scale == "free":
         return T / (1 - E)
     return problem.k * E + 2 * (1 - problem.k) * np.sqrt(np.maximum(T, 0))
@@ -79,9 +81,9 @@ def relative_residual(k: np.ndarray | float, g: np.ndarray, scale: str) -> np.nd
     return np.sqrt(np.maximum(square, 0))
 
 
-def one(problem: vs.Problem) -> vs.Problem:
+def one(problem: vg.Problem) -> vg.Problem:
     """The first of N problems, as floats."""
-    return vs._map(lambda values: values[0].item(), problem)
+    return map_tree(lambda values: values[0].item(), problem)
 
 
 # --- the tables
@@ -161,14 +163,14 @@ def uncertified_table(count: int = 20000) -> list[str]:
     return table(head, rows)
 
 
-def optima(problem: vs.Problem, scale: str) -> np.ndarray:
+def optima(problem: vg.Problem, scale: str) -> np.ndarray:
     """(N, ``_MOST_OPTIMA``) the goal at all local optima that climbs from all over the sphere find, best first; -1
     where there are no more."""
     N = len(problem.k)
     known, goals, count = np.zeros((N, _MOST_OPTIMA, 3)), np.full((N, _MOST_OPTIMA), -1.0), np.zeros(N, int)
-    for view in vs._Arrays.climbs(problem, vs._fibonacci_sphere(_STARTS), scale):
+    for view in vg.climb_from_each(Arrays, problem, vs.fibonacci_sphere(_STARTS), scale):
         n = np.stack(view.n, axis=1)
-        new = vs._is_optimum(view) & ((known @ n[..., None])[..., 0].max(1) < vs._COS_APART) & (count < _MOST_OPTIMA)
+        new = vg.is_optimum(view) & ((known @ n[..., None])[..., 0].max(1) < vg.COS_APART) & (count < _MOST_OPTIMA)
         row = np.flatnonzero(new)
         known[row, count[row]], goals[row, count[row]] = n[row], view.g[row]
         count += new
@@ -248,10 +250,10 @@ def tables() -> dict[str, list[str]]:
 # --- the map of the viewing hemisphere
 
 
-def disc_frame(problem: vs.Problem, n: np.ndarray) -> np.ndarray:
+def disc_frame(problem: vg.Problem, n: np.ndarray) -> np.ndarray:
     """Rows: right and up on the map and its centre c; n and its Necker reversal lie level."""
     centre = np.array(problem.c) / np.linalg.norm(problem.c)
-    across = n - np.array(vs._reversal(tuple(n)))
+    across = n - np.array(vg.reversal(tuple(n)))
     across = across - (across @ centre) * centre
     across /= np.linalg.norm(across)
     return np.array([across, np.cross(centre, across), centre])
@@ -272,9 +274,9 @@ def disc_grid(frame: np.ndarray, size: int = 301) -> tuple[np.ndarray, np.ndarra
     return p, np.where(square <= 1, x, np.nan) @ frame
 
 
-def climb_path(problem: vs.Problem, n: vs.Vector, scale: str) -> np.ndarray:
+def climb_path(problem: vg.Problem, n: Vector, scale: str) -> np.ndarray:
     """(steps,3) directions that the solver passes on its way up."""
-    return np.array([vs._climb(vs._Floats, problem, n, scale, steps).n for steps in range(12)])
+    return np.array([vg.newton(Floats, problem, n, scale, steps).n for steps in range(12)])
 
 
 def draw_maps(path: Path) -> None:
@@ -318,16 +320,16 @@ def _caption(found: OnP) -> str:
     return f"two optima, ambiguity {found.ambiguity[0]:.2f}"
 
 
-def _draw_map(axes, problem: vs.Problem, V: np.ndarray, frame: np.ndarray, found: OnP, scale: str, R: np.ndarray):
+def _draw_map(axes, problem: vg.Problem, V: np.ndarray, frame: np.ndarray, found: OnP, scale: str, R: np.ndarray):
     p, n = disc_grid(frame)
     cost = relative_residual(problem.k, goal(problem, *energies(problem, n), scale), scale)
     low = 0.1 * np.floor(10 * np.nanmin(cost))
     filled = axes.contourf(*p.T, cost.T, _LEVELS, cmap="cividis", extend="both")
     axes.contour(*p.T, cost.T, np.arange(low, low + 0.3, 0.02), colors="white", linewidths=0.4, alpha=0.6)
     axes.add_patch(_circle())
-    start = vs._start(vs._Floats, problem)
+    start = vs.start_direction(Floats, problem)
     first = climb_path(problem, start, scale)
-    for directions in (first, climb_path(problem, vs._reversal(tuple(first[-1])), scale)):
+    for directions in (first, climb_path(problem, vg.reversal(tuple(first[-1])), scale)):
         way = to_disc(frame, directions)
         far = np.linalg.norm(np.diff(way, axis=0), axis=1) > 1.2  # round the rim, to the other side of the map
         way = np.insert(way, np.flatnonzero(far) + 1, np.nan, axis=0)
@@ -337,7 +339,7 @@ def _draw_map(axes, problem: vs.Problem, V: np.ndarray, frame: np.ndarray, found
     for n, marker, size, face, edge, label in (
         (best, "o", 15, "none", "white", "optimum"),
         (second, "s", 14, "none", "white", "second optimum"),
-        (np.array(vs._reversal(tuple(best))), "x", 8, "white", "white", "its Necker reversal, and the way up"),
+        (np.array(vg.reversal(tuple(best))), "x", 8, "white", "white", "its Necker reversal, and the way up"),
         (R[2] @ V, "*", 12, _PINK, "black", "true direction, before the noise"),
         (start, "^", 7, _ORANGE, "black", "start, and the way up"),
     ):
@@ -358,7 +360,7 @@ def _circle():
 # --- the certificate
 
 
-def bound(problem: vs.Problem, E: np.ndarray, T: np.ndarray, tau: float) -> np.ndarray:
+def bound(problem: vg.Problem, E: np.ndarray, T: np.ndarray, tau: float) -> np.ndarray:
     """The quadratic that touches the unit-scale goal where sqrt(T) is tau, and is nowhere below it."""
     return problem.k * E + (1 - problem.k) * (T / tau + tau)
 
@@ -374,12 +376,12 @@ def uncertified_problem() -> tuple[np.ndarray, np.ndarray]:
 def _looseness(S: np.ndarray, W: np.ndarray) -> float:
     """How far the bound rises above the best goal, over that goal."""
     problem, best = _with_best(S, W, "unit")
-    E, T = energies(problem, np.array(vs._fibonacci_sphere(5000)))
+    E, T = energies(problem, np.array(vs.fibonacci_sphere(5000)))
     tau = np.sqrt(energies(problem, best)[1])
     return bound(problem, E, T, tau).max() / goal(problem, *energies(problem, best), "unit") - 1
 
 
-def _with_best(S: np.ndarray, W: np.ndarray, scale: str) -> tuple[vs.Problem, np.ndarray]:
+def _with_best(S: np.ndarray, W: np.ndarray, scale: str) -> tuple[vg.Problem, np.ndarray]:
     problems, V = reduced(S, W)
     return one(problems), onp(S, W, scale=scale).R[0, 2] @ V[0]
 

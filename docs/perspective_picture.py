@@ -19,9 +19,9 @@ from msg_adapters import Intrinsics
 from paul_ros import metrics
 from paul_ros.files import write_atomically
 from paul_ros.layout import load_layout
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.offline.bag import read_messages
-from paul_ros.onp import OnP, onp
+from paul_ros.orthographic_n_point import OnP, onp
 from paul_ros.pinhole_pose import refine
 from paul_ros.placement import centred_view, place
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Body axes of lifted persons, as REP-155 has them: x out of the chest, y to the left, z to the head; as quaternions.
+"""Body axes of lifted persons (REP-155: x out of the chest, y to the left, z to the head), as quaternions.
 
-A layout with hips and shoulders by their usual names has them from these four points. Else the layout's first rule of
-handedness tells left and up; the rest follows from left x up = forward. A layout without either, as of a thing that has
-no chest, gives the rotation of the model's canonical frame, which is the same for all poses of one shape.
+Hips and shoulders with their usual names define the axes.  Without them, the layout's first rule of handedness defines
+left and up, and left x up = forward gives the rest.  A layout without either, for instance of an object without a
+chest, gets the rotation of the model's canonical frame, which is the same for all poses of one shape.
 """
 
 from __future__ import annotations
@@ -13,11 +13,19 @@ import numpy as np
 from paul_ros.layout import Layout
 
 _CORNERS = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
-_LEAST_SINE = 1e-6  # between left and up: less fixes no plane
+_LEAST_SINE = 1e-6  # of the angle between left and up; below it they fix no plane
 
 
 def left_and_up(layout: Layout) -> np.ndarray | None:
-    """(2,P): times points (P,3) a vector to the left and one up; None where the layout tells neither."""
+    """Return weights (2,P) of points: ``weights @ points`` is a vector to the left and one up.
+
+    Returns:
+        None if the layout defines neither.
+    """
+    left: tuple[int, ...]
+    right: tuple[int, ...]
+    below: tuple[int, ...]
+    above: tuple[int, ...]
     place = {name: index for index, name in enumerate(layout.names)}
     if set(_CORNERS) <= set(place):
         left_hip, right_hip, left_shoulder, right_shoulder = (place[name] for name in _CORNERS)
@@ -35,12 +43,12 @@ def left_and_up(layout: Layout) -> np.ndarray | None:
 
 
 def body_rotations(points: np.ndarray, rotation: np.ndarray, measures: np.ndarray | None) -> np.ndarray:
-    """Rotations (N,3,3) from body axes to the camera's frame.
+    """Return rotations (N,3,3) from body axes to the camera frame.
 
     Args:
-        points: (N,P,3) lifted points of a layout, camera frame.
-        rotation: (N,3,3) canonical frame to camera frame, taken where the points or the layout tell nothing else.
-        measures: (2,P), what `left_and_up` gives for that layout.
+        points: (N,P,3) lifted points, camera frame.
+        rotation: (N,3,3) canonical frame to camera frame, the fallback where points or layout fix no axes.
+        measures: (2,P) weights from ``left_and_up`` for the layout of the points.
     """
     if measures is None:
         return rotation
@@ -53,15 +61,19 @@ def body_rotations(points: np.ndarray, rotation: np.ndarray, measures: np.ndarra
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross products of vectors (N,3); numpy's own takes ten times as long for a few."""
+    """Return cross products of vectors (N,3); for a few vectors numpy's own takes ten times as long."""
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def quaternions(R: np.ndarray) -> np.ndarray:
-    """Unit quaternions (N,4), x, y, z, w with w >= 0, of rotations (N,3,3).
+    """Return unit quaternions (N,4), in order x, y, z, w with w >= 0, of rotations (N,3,3).
 
-    Four times the outer product of a quaternion with itself is linear in its rotation; its largest row is the
-    quaternion but for length and sign.
+    Four times the outer product of a quaternion with itself is linear in the rotation.  Its largest row is the
+    quaternion up to length and sign.
+
+    >>> import numpy as np
+    >>> quaternions(np.eye(3)[None]).tolist()
+    [[0.0, 0.0, 0.0, 1.0]]
     """
     (a, b, c), (d, e, f), (g, h, i) = R.transpose(1, 2, 0)
     square = np.array(
@@ -78,21 +90,27 @@ def quaternions(R: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True) * np.where(q[:, 3:] < 0, -1.0, 1.0)
 
 
-class Steady:
-    """Signs of quaternions, kept from frame to frame.
+class ContinuousSigns:
+    """Signs of quaternions that are continuous from frame to frame.
 
-    q and -q are the same attitude, and any rule for one frame alone jumps between them somewhere. Here a person's has
-    the sign that is nearer to that of the frame before; one without an id, or not seen in that frame, has w >= 0.
+    q and -q are the same attitude, and every rule for single frames jumps between them somewhere.  Here the quaternion
+    of a tracked person has the sign nearer to the previous frame's.  Without an id, or if the person was not in the
+    previous frame, w >= 0.
     """
 
     def __init__(self) -> None:
         self._last: dict[str, np.ndarray] = {}
 
     def __call__(self, ids: tuple[str, ...], q: np.ndarray) -> np.ndarray:
-        """The quaternions (N,4) of N persons with their signs settled; NaN rows stay."""
-        q = np.array([-row if self._against(name, row) else row for name, row in zip(ids, q)]).reshape(-1, 4)
+        """Return quaternions (N,4) of the persons of the next frame with continuous signs; NaN rows stay NaN.
+
+        Args:
+            ids: N person ids, '' where unknown.
+            q: (N,4) quaternions of either sign.
+        """
+        q = np.array([-row if self._is_opposite(name, row) else row for name, row in zip(ids, q)]).reshape(-1, 4)
         self._last = {name: row for name, row in zip(ids, q) if name and np.isfinite(row).all()}
         return q
 
-    def _against(self, name: str, row: np.ndarray) -> bool:
+    def _is_opposite(self, name: str, row: np.ndarray) -> bool:
         return name in self._last and float(self._last[name] @ row) < 0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that a user can cause and mend: the text of each is one clear line that says what to do.
+"""Errors that a user can cause and fix.  The text of each is one line that says what to do.
 
-Any other exception is a fault of this package and shows its traceback.
+Any other exception is a bug of this package and shows its traceback.
 """
 
 from __future__ import annotations
@@ -13,6 +13,10 @@ class PaulError(Exception):
 
 class MissingPackageError(PaulError, ImportError):
     """An optional Python package is not installed."""
+
+
+class InputError(PaulError, ValueError):
+    """An argument of the Python API has a wrong shape, type or value."""
 
 
 class ModelError(PaulError, ValueError):
@@ -28,14 +32,14 @@ class ParameterError(PaulError, ValueError):
 
 
 class NpzError(PaulError, ValueError):
-    """An npz file cannot be used; the text follows the file's name."""
+    """An npz file cannot be used.  The text continues a sentence that begins with the file's name."""
 
 
 class BagError(PaulError):
     """A bag cannot be read or written.
 
     Attributes:
-        messages_read: number of messages that were read before the damage.
+        messages_read: number of messages read before the damage.
     """
 
     def __init__(self, text: str, messages_read: int = 0) -> None:
@@ -44,7 +48,7 @@ class BagError(PaulError):
 
 
 class WriteError(BagError):
-    """A bag cannot be written to its end."""
+    """A bag cannot be completed."""
 
 
 class WrongTopicError(BagError):
@@ -56,7 +60,7 @@ class PictureError(PaulError):
 
 
 class DemoError(PaulError):
-    """The demo cannot run, or the node did not answer as it should."""
+    """The demo cannot run, or the node gave a wrong answer or none."""
 
 
 class NodeBenchmarkError(PaulError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Optional Python packages: imported late, and named with the cure where they are missing."""
+"""Optional Python packages: they are imported late, and an error names the missing one and its installation."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def require(extra: str, *modules: str) -> None:
         modules: import names that the caller is about to use.
 
     Raises:
-        MissingPackageError: one is not installed; names it and the command that installs it.
+        MissingPackageError: a package is not installed.  The text names it and the command that installs it.
     """
     for module in modules:
         try:
             importlib.import_module(module)
         except ModuleNotFoundError as error:
             if error.name and not module.startswith(error.name):
-                raise  # the module is there, and something that it imports is not
+                raise  # the module itself is installed, but one of its own imports is not
             raise MissingPackageError(
                 f"the Python package '{module}' is missing: pip install 'paul_ros[{extra}]'"
             ) from error

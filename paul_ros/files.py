@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are written whole or not at all, and read without running anything that they hold."""
+"""Files: written atomically, and read without executing anything in them."""
 
 from __future__ import annotations
 
@@ -13,34 +13,46 @@ import numpy as np
 
 from paul_ros.errors import NpzError
 
-_NAMED = 5  # arrays in a message
+_NAMED = 5  # most arrays that an error names
 
 
 def read_npz(
     file: str | os.PathLike | BinaryIO, needed: Collection[str], optional: Collection[str] = ()
 ) -> dict[str, np.ndarray]:
-    """Arrays of an npz by their names; nothing else of it is opened.
+    """Read arrays of an npz file by name; other arrays are not opened.
+
+    Args:
+        file: path, or a file opened for reading bytes.
+        needed: names of arrays that must exist.
+        optional: names of arrays that may be missing.
+
+    Returns:
+        The arrays by name, without the missing optional ones.
 
     Raises:
-        NpzError: it cannot be read, is damaged, holds pickled objects where arrays are wanted, or lacks a needed one.
+        NpzError: the file cannot be read, is damaged, has pickled objects for arrays, or lacks a needed array.
     """
     try:
         with np.load(file, allow_pickle=False) as archive:
-            there = archive.files
-            arrays = {name: archive[name] for name in (*needed, *optional) if name in there}
+            present = archive.files
+            arrays = {name: archive[name] for name in (*needed, *optional) if name in present}
     except FileNotFoundError as error:
         raise NpzError("is not there") from error
-    except Exception as error:  # numpy and zipfile report damage in a dozen ways; numpy's own advice is to unpickle
-        raise NpzError("holds pickled objects or is no npz: save plain arrays with np.savez") from error
+    except Exception as error:  # numpy and zipfile report damage in a dozen ways; numpy itself advises to unpickle
+        raise NpzError("has pickled objects or is no npz file: save plain arrays with np.savez") from error
     for name in needed:
-        if name not in there:
-            more = f" and {len(there) - _NAMED} more" if len(there) > _NAMED else ""
-            raise NpzError(f"has no array {name}; it has {', '.join(there[:_NAMED]) or 'none'}{more}")
+        if name not in present:
+            more = f" and {len(present) - _NAMED} more" if len(present) > _NAMED else ""
+            raise NpzError(f"has no array {name}; it has {', '.join(present[:_NAMED]) or 'none'}{more}")
     return arrays
 
 
 def write_atomically(path: str | os.PathLike, data: bytes) -> None:
-    """Write a file that is there whole or not at all; an OSError names it, as of a full disk it would not."""
+    """Write a file that is complete or unchanged; missing folders are made.
+
+    Raises:
+        OSError: the file cannot be written.  The error names the file, also if the disk is full.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

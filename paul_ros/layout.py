@@ -1,77 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Named keypoints: what the P points of an array are, how they hang together, how layouts map onto another.
+"""Layouts: named keypoints, their edges and sides, and mappings between layouts.
 
-All shipped layouts name their points in one vocabulary, so a layout maps onto another by name alone. Points
-of two layouts that are only nearly the same place on the body have different names there.
+All shipped layouts take their names from one vocabulary, so a layout maps onto another by name alone.  Points at only
+nearly the same place on the body have different names.
 """
 
 from __future__ import annotations
 
 import difflib
 import functools
+import os
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
-from paul_ros.errors import LayoutError
-
-#: Fewest points that a mapping must fill: two would leave the pose of a rigid body open.
-MIN_MAPPED = 3
+from paul_ros.errors import InputError, LayoutError
+from paul_ros.layout_schema import MIN_POINTS, Pair, Points, parse
 
 _SHIPPED = resources.files("paul_ros") / "layouts"
 _MAX_BYTES = 1_000_000
-_MAX_POINTS = 20_000
-_KEYS = (
-    "name",
-    "description",
-    "names",
-    "edges",
-    "left_right",
-    "root",
-    "derived",
-    "handedness",
-    "categories",
-    "min_visible",
-)
 
 
 @dataclass(frozen=True)
 class Handedness:
-    """A rule of anatomy that tells a shape from its mirror image; each field holds point indices.
+    """A rule of anatomy that distinguishes a shape from its mirror image; each attribute holds point indices.
 
-    With m(.) the mean of points, (m(left) - m(right)) x (m(above) - m(below)) points along m(front) -
-    m(behind) in any right-handed frame: left x up = forward, as in REP-103's body frame.
+    With m(.) the mean of points, (m(left) - m(right)) x (m(above) - m(below)) points along m(front) - m(behind) in
+    any right-handed frame: left x up = forward, as in REP-103's body frame.
     """
 
-    left: tuple[int, ...]
-    right: tuple[int, ...]
-    below: tuple[int, ...]
-    above: tuple[int, ...]
-    behind: tuple[int, ...]
-    front: tuple[int, ...]
+    left: Points
+    right: Points
+    below: Points
+    above: Points
+    behind: Points
+    front: Points
 
 
 @dataclass(frozen=True)
 class Part:
-    """Points that belong to one object, and the edges between them, as indices of the layout."""
+    """The points of one object and the edges between them, as indices of the layout."""
 
-    points: tuple[int, ...]
-    edges: tuple[tuple[int, int], ...]
+    points: Points
+    edges: tuple[Pair, ...]
 
     @functools.cached_property
     def columns(self) -> slice | list[int]:
-        """The points as an index of arrays; those that lie side by side as a slice, which copies nothing."""
+        """Index of arrays that selects the points: a slice, which copies nothing, if they lie side by side."""
         first, last = self.points[0], self.points[-1]
-        together = self.points == tuple(range(first, last + 1))
-        return slice(first, last + 1) if together else list(self.points)
+        adjacent = self.points == tuple(range(first, last + 1))
+        return slice(first, last + 1) if adjacent else list(self.points)
 
     @functools.cached_property
     def ends(self) -> np.ndarray:
-        """(2,E) indices of the edges' ends."""
+        """(2,E) point indices of the ends of the edges."""
         return np.array(self.edges, int).reshape(-1, 2).T
 
 
@@ -79,49 +66,62 @@ class Part:
 class Layout:
     """P named keypoints in order.
 
-    names: P names. edges: bones, as pairs of point indices. left_right: pairs of (left, right) indices.
-    root: the indices whose mean is the root point. derived: name -> indices whose mean that point is.
-    handedness: rules of anatomy; may be empty. description: what it is and where its order comes from.
-    categories: kinds of objects whose points lie side by side: name -> its points, of which alone a frame of that kind
-    has any; empty where all points are of one object.
-    min_visible: fewest points that a frame of one object must show to be lifted; None: a share of them all (model.py).
+    >>> layout = load_layout("coco17")
+    >>> layout.names[:3], len(layout.names), layout.derived["pelvis"]
+    (('nose', 'left_eye', 'right_eye'), 17, (11, 12))
+
+    Attributes:
+        name: name of the layout.
+        names: P names of points.
+        edges: bones, pairs of point indices.
+        left_right: pairs of (left, right) point indices.
+        root: the indices whose mean is the root point.
+        derived: names of further points -> the indices whose mean each is.
+        handedness: rules of anatomy; may be empty.
+        description: what the layout is and the source of its order.
+        categories: kinds of objects whose points lie side by side: name -> point indices.  A frame of one kind has
+            points of that category only.  Empty if all points belong to one object.
+        min_visible: fewest visible points of an object that are lifted; None for 30 %, at least 4.
     """
 
     name: str
     names: tuple[str, ...]
-    edges: tuple[tuple[int, int], ...]
-    left_right: tuple[tuple[int, int], ...]
-    root: tuple[int, ...]
-    derived: dict[str, tuple[int, ...]]
+    edges: tuple[Pair, ...]
+    left_right: tuple[Pair, ...]
+    root: Points
+    derived: dict[str, Points]
     handedness: tuple[Handedness, ...]
     description: str = ""
-    categories: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    categories: dict[str, Points] = field(default_factory=dict)
     min_visible: int | None = None
 
     @classmethod
     def from_dict(cls, data: object) -> Layout:
-        """The layout that a YAML file or a model's header describes; the inverse of to_dict.
+        """Build the layout that a YAML file or a model's header describes; the inverse of ``to_dict``.
 
-        Raises LayoutError, naming the key at fault.
+        Raises:
+            LayoutError: the data describe no layout; the text names the key at fault.
         """
-        return _parse(data)
+        attributes = parse(data)
+        rules = tuple(Handedness(**rule) for rule in attributes.pop("handedness"))
+        return cls(**attributes, handedness=rules)
 
-    def to_dict(self) -> dict:
-        """Plain lists and names, for JSON or YAML."""
-        layout = {
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and names, for JSON or YAML."""
+        layout: dict[str, Any] = {
             "name": self.name,
             "description": self.description,
             "names": list(self.names),
-            "edges": [self._named(edge) for edge in self.edges],
-            "left_right": [self._named(pair) for pair in self.left_right],
-            "root": self._named(self.root),
-            "derived": {name: self._named(parts) for name, parts in self.derived.items()},
+            "edges": [self.point_names(edge) for edge in self.edges],
+            "left_right": [self.point_names(pair) for pair in self.left_right],
+            "root": self.point_names(self.root),
+            "derived": {name: self.point_names(parts) for name, parts in self.derived.items()},
             "handedness": [
-                {part: self._named(points) for part, points in vars(rule).items()} for rule in self.handedness
+                {part: self.point_names(points) for part, points in vars(rule).items()} for rule in self.handedness
             ],
         }
         if self.categories:
-            layout["categories"] = {name: self._named(points) for name, points in self.categories.items()}
+            layout["categories"] = {name: self.point_names(points) for name, points in self.categories.items()}
         if self.min_visible:
             layout["min_visible"] = self.min_visible
         return layout
@@ -136,14 +136,14 @@ class Layout:
 
     @functools.cached_property
     def mirrored_edges(self) -> np.ndarray:
-        """(E,) indices: for each edge the one on the other side, or itself where there is none."""
+        """(E,) index of every edge's counterpart on the other side, or of the edge itself without one."""
         place = {frozenset(edge): index for index, edge in enumerate(self.edges)}
         twins = (frozenset(self.mirror[list(edge)].tolist()) for edge in self.edges)
         return np.array([place.get(twin, index) for index, twin in enumerate(twins)], int)
 
     @functools.cached_property
     def parts(self) -> tuple[Part, ...]:
-        """The categories; one part of all points where there are none."""
+        """One part a category, or one part of all points without categories."""
         if not self.categories:
             return (Part(tuple(range(len(self.names))), self.edges),)
         own = [(points, set(points)) for points in self.categories.values()]
@@ -153,66 +153,87 @@ class Layout:
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """P of 'left', 'right' or '' for a point of the middle."""
+        """P sides: 'left', 'right' or '' for a point of the middle."""
         sides = [""] * len(self.names)
         for left, right in self.left_right:
             sides[left], sides[right] = "left", "right"
         return tuple(sides)
 
     def map_to(self, target: Layout) -> Mapping:
-        """How arrays in this layout become arrays in the target's: by name, derived points as means.
+        """Return the mapping of arrays to another layout, by name; derived points are means.
 
-        Raises LayoutError where fewer than MIN_MAPPED points of the target can be filled.
+        Raises:
+            LayoutError: fewer than 3 points of the target can be filled; the text names layouts that fit.
         """
         sources = self._sources(target)
         filled = sum(bool(parts) for parts in sources)
-        if filled < MIN_MAPPED:
+        if filled < MIN_POINTS:
             raise LayoutError(
                 f"layout '{self.name}' has {filled} of the {len(target.names)} points of '{target.name}', "
-                f"at least {MIN_MAPPED} are needed. Layouts that map onto '{target.name}': {_fitting(target)}"
+                f"at least {MIN_POINTS} are needed. Layouts that map onto '{target.name}': {_layouts_onto(target)}"
             )
         return Mapping(self, target, sources)
 
-    def _sources(self, target: Layout) -> tuple[tuple[int, ...], ...]:
+    def point_names(self, points: tuple[int, ...]) -> list[str]:
+        """Return the names of points by index."""
+        return [self.names[index] for index in points]
+
+    def _sources(self, target: Layout) -> tuple[Points, ...]:
         known = {**self.derived, **{name: (index,) for index, name in enumerate(self.names)}}
         return tuple(known.get(name, ()) for name in target.names)
-
-    def _named(self, points: tuple[int, ...]) -> list[str]:
-        return [self.names[index] for index in points]
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """Arrays of one layout into another. sources: per target point the source indices whose mean it is."""
+    """A mapping of arrays from one layout to another.
+
+    Attributes:
+        source: layout of the arrays that come in.
+        target: layout of the arrays that come out.
+        sources: for each point of the target the source indices whose mean it is; () if the source lacks it.
+    """
 
     source: Layout
     target: Layout
-    sources: tuple[tuple[int, ...], ...]
+    sources: tuple[Points, ...]
 
     def __call__(
         self, xy: np.ndarray, confidence: np.ndarray, visible: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """xy (N,P,2), confidence (N,P), visible (N,P) -> the same in the target's P points.
+        """Map 2D keypoints.  Points that the source lacks are hidden: xy NaN, confidence 0.
 
-        A point that the source lacks is hidden: xy NaN, confidence 0. A derived point is the mean of its
-        parts, visible only where all of them are. Raises ValueError where the arrays do not have the source's
-        points.
+        Args:
+            xy: (N,P,2) any unit.
+            confidence: (N,P).
+            visible: (N,P) bool.  A derived point is visible only if all its parts are.
+
+        Returns:
+            The same with the target's points.
+
+        Raises:
+            InputError: the arrays do not have the source's points.
         """
         self._check(xy, confidence, visible)
         if self.source.names == self.target.names:
             return xy, confidence, visible
-        seen = np.zeros((len(xy), len(self.sources)), dtype=bool)
-        for points, parts in self._groups:
-            seen[:, points] = visible[:, parts].all(1)
-        return self.values(xy), self.values(confidence, 0.0), seen
+        return self.values(xy), self.values(confidence, 0.0), self.visibility(visible)
 
     def values(self, array: np.ndarray, lacking: float = np.nan) -> np.ndarray:
-        """Values (N,P,...) of the source's points as those (N,Q,...) of the target's; `lacking` where none are."""
+        """Map values (N,P,...) of the source's points to (N,Q,...); ``lacking`` for points that the source lacks."""
         if self.source.names == self.target.names:
             return array
         mapped = np.full((len(array), len(self.sources), *array.shape[2:]), lacking)
         for points, parts in self._groups:
             mapped[:, points] = array[:, parts].sum(1) / len(parts)
+        return mapped
+
+    def visibility(self, visible: np.ndarray) -> np.ndarray:
+        """Map visibility (N,P) to (N,Q): a point is visible if the source has all its parts, and they are visible."""
+        if self.source.names == self.target.names:
+            return visible
+        mapped = np.zeros((len(visible), len(self.sources)), dtype=bool)
+        for points, parts in self._groups:
+            mapped[:, points] = visible[:, parts].all(1)
         return mapped
 
     @functools.cached_property
@@ -225,50 +246,25 @@ class Mapping:
     def _check(self, xy: np.ndarray, confidence: np.ndarray, visible: np.ndarray) -> None:
         expected = len(xy), len(self.source.names)
         if xy.shape != (*expected, 2) or confidence.shape != expected or visible.shape != expected:
-            raise ValueError(
+            raise InputError(
                 f"layout '{self.source.name}' needs xy (N,{expected[1]},2), confidence and visible "
                 f"(N,{expected[1]}), got {xy.shape}, {confidence.shape}, {visible.shape}"
             )
 
 
+# --- shipped layouts, and those of users
+
+
 def layout_names() -> tuple[str, ...]:
-    """The shipped layouts, sorted."""
+    """Return the names of the shipped layouts, sorted."""
     return tuple(sorted(file.name[:-5] for file in _SHIPPED.iterdir() if file.name.endswith(".yaml")))
 
 
-def middles(layout: Layout) -> dict[int, tuple[int, ...]]:
-    """Points of a shipped layout that others derive from points which it has too: point -> those it is the mean of.
+def load_layout(name_or_path: str | os.PathLike[str]) -> Layout:
+    """Load a shipped layout by name, an anonymous one by number (``points41``), or a YAML file by path.
 
-    So are pelvis and neck of `human` the middles of hips and shoulders. Of a user's layout nothing is known: the same
-    names may be of an animal, whose neck is elsewhere.
-    """
-    if layout.name not in layout_names() or layout.names != load_layout(layout.name).names:
-        return {}
-    place, found = {name: index for index, name in enumerate(layout.names)}, {}
-    for other in map(load_layout, layout_names()):
-        for name, parts in other.derived.items():
-            named = other._named(parts)
-            if name in place and place.keys() >= set(named):
-                found[place[name]] = tuple(place[part] for part in named)
-    return found
-
-
-def anonymous_layout(points: int, edges: tuple[tuple[int, int], ...] = ()) -> Layout:
-    """A layout for P points of which nothing is known but how they hang together: p00, p01, ...
-
-    Raises LayoutError: too few or too many points, or edges that join no two of them.
-    """
-    names = [f"p{point:0{max(2, len(str(points - 1)))}d}" for point in range(points)]
-    if any(not 0 <= point < points for edge in edges for point in edge):
-        raise LayoutError(f"edges must join points 0 to {points - 1}")
-    named = [[names[point] for point in edge] for edge in edges]
-    return Layout.from_dict({"name": f"points{points}", "names": names, "edges": named, "root": names})
-
-
-def load_layout(name_or_path: str | Path) -> Layout:
-    """A shipped layout by name, an anonymous one as points41, or a user's own by the path of its YAML file.
-
-    Raises LayoutError: unknown name, unreadable or oversized file, or a file that describes no layout.
+    Raises:
+        LayoutError: the name is unknown, or the file is unreadable, too large, or describes no layout.
     """
     name = str(name_or_path)
     if name in layout_names():
@@ -284,9 +280,47 @@ def load_layout(name_or_path: str | Path) -> Layout:
         raise LayoutError(f"layout file {path}: {error}") from None
 
 
+def anonymous_layout(points: int, edges: tuple[Pair, ...] = ()) -> Layout:
+    """Return a layout of P points without meaning: p00, p01, ...
+
+    Args:
+        points: number of points P.
+        edges: pairs of point indices.
+
+    Raises:
+        LayoutError: too few or too many points, or an edge that does not join two of them.
+    """
+    names = [f"p{point:0{max(2, len(str(points - 1)))}d}" for point in range(points)]
+    if any(not 0 <= point < points for edge in edges for point in edge):
+        raise LayoutError(f"edges must join points 0 to {points - 1}")
+    named = [[names[point] for point in edge] for edge in edges]
+    return Layout.from_dict({"name": f"points{points}", "names": names, "edges": named, "root": names})
+
+
+def midpoints(layout: Layout) -> dict[int, Points]:
+    """Return the points of a shipped layout that are means of others of its points.
+
+    They are found from other shipped layouts, which derive them: pelvis and neck of ``human`` are the midpoints of
+    hips and shoulders.  A user's layout has none, because its names may belong to an animal, whose neck is elsewhere.
+
+    Returns:
+        Index of each such point -> indices of the points whose mean it is.
+    """
+    if layout.name not in layout_names() or layout.names != load_layout(layout.name).names:
+        return {}
+    place = {name: index for index, name in enumerate(layout.names)}
+    found: dict[int, Points] = {}
+    for other in map(load_layout, layout_names()):
+        for name, parts in other.derived.items():
+            named = other.point_names(parts)
+            if name in place and place.keys() >= set(named):
+                found[place[name]] = tuple(place[part] for part in named)
+    return found
+
+
 @functools.cache
 def _shipped(name: str) -> Layout:
-    # With libyaml in a tenth of the time. Not for users' files: it recurses in C, where too deep a nesting is no error.
+    # libyaml takes a tenth of the time. It is not for users' files: it recurses in C, and deep nesting would crash it.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     return Layout.from_dict(yaml.load((_SHIPPED / f"{name}.yaml").read_bytes(), loader))
 
@@ -311,137 +345,8 @@ def _read_yaml(path: Path) -> object:
         raise LayoutError(f"no YAML: {' '.join(str(error).split())[:200]}") from None
 
 
-def _fitting(target: Layout) -> str:
+def _layouts_onto(target: Layout) -> str:
+    """Return the names of the shipped layouts that map onto the target, as text for an error."""
     shipped = (load_layout(name) for name in layout_names())
-    names = [layout.name for layout in shipped if sum(map(bool, layout._sources(target))) >= MIN_MAPPED]
+    names = [layout.name for layout in shipped if sum(map(bool, layout._sources(target))) >= MIN_POINTS]
     return ", ".join(names) or "none of the shipped ones; name its points as one of them does"
-
-
-def _parse(data: object) -> Layout:
-    data = _mapping(data, "a layout")
-    unknown = [key if isinstance(key, str) else _shown(key) for key in data if key not in _KEYS]
-    if unknown:
-        raise LayoutError(f"unknown key {_listed(unknown)}; the keys are {', '.join(_KEYS)}")
-    missing = [key for key in ("name", "names", "root") if key not in data]
-    if missing:
-        raise LayoutError(f"{_listed(missing)} missing")
-    names = _names(data["names"])
-    index = {name: place for place, name in enumerate(names)}
-    derived = {
-        _text(name, "a name in derived"): _points(parts, f"derived '{name}'", index)
-        for name, parts in _mapping(data.get("derived", {}), "derived").items()
-    }
-    clashes = [name for name in derived if name in index]
-    if clashes:
-        raise LayoutError(f"derived {_listed(clashes)} is among the names already")
-    return Layout(
-        name=_text(data["name"], "name"),
-        names=names,
-        edges=_pairs(data.get("edges", []), "edges", index),
-        left_right=_sides(data.get("left_right", []), index),
-        root=_root(data["root"], index, derived),
-        derived=derived,
-        handedness=tuple(_rule(rule, index) for rule in _list(data.get("handedness", []), "handedness")),
-        description=_text(data["description"], "description").strip() if data.get("description") else "",
-        categories=_categories(data.get("categories", {}), index),
-        min_visible=_min_visible(data["min_visible"], names) if "min_visible" in data else None,
-    )
-
-
-def _names(value: object) -> tuple[str, ...]:
-    names = tuple(_text(name, "a name in names") for name in _list(value, "names"))
-    if not MIN_MAPPED <= len(names) <= _MAX_POINTS:
-        raise LayoutError(f"names has {len(names)} points; from {MIN_MAPPED} to {_MAX_POINTS} can be lifted")
-    seen: set[str] = set()
-    twice = [name for name in names if name in seen or seen.add(name)]
-    if twice:
-        raise LayoutError(f"names has {_listed(twice)} more than once")
-    return names
-
-
-def _root(value: object, index: dict[str, int], derived: dict[str, tuple[int, ...]]) -> tuple[int, ...]:
-    if isinstance(value, str) and value in derived:
-        return derived[value]
-    return _points([value] if isinstance(value, str) else value, "root", index)
-
-
-def _sides(value: object, index: dict[str, int]) -> tuple[tuple[int, int], ...]:
-    pairs = _pairs(value, "left_right", index)
-    used = [point for pair in pairs for point in pair]
-    if len(set(used)) < len(used):
-        raise LayoutError("left_right has a point in two pairs")
-    return pairs
-
-
-def _categories(value: object, index: dict[str, int]) -> dict[str, tuple[int, ...]]:
-    categories = {
-        _text(name, "a name in categories"): _points(points, f"category '{name}'", index)
-        for name, points in _mapping(value, "categories").items()
-    }
-    if categories and sorted(point for points in categories.values() for point in points) != list(range(len(index))):
-        raise LayoutError("categories must have every point once")
-    return categories
-
-
-def _min_visible(value: object, names: tuple[str, ...]) -> int:
-    if type(value) is not int or not MIN_MAPPED <= value <= len(names):
-        raise LayoutError(f"min_visible must be a whole number from {MIN_MAPPED} to the {len(names)} points")
-    return value
-
-
-def _rule(value: object, index: dict[str, int]) -> Handedness:
-    rule = _mapping(value, "a rule in handedness")
-    parts = [field.name for field in fields(Handedness)]
-    if set(rule) != set(parts):
-        raise LayoutError(f"a rule in handedness has the keys {', '.join(parts)}, all of them and no other")
-    return Handedness(*(_points(rule[part], f"handedness {part}", index) for part in parts))
-
-
-def _pairs(value: object, where: str, index: dict[str, int]) -> tuple[tuple[int, int], ...]:
-    pairs = tuple(_points(pair, where, index) for pair in _list(value, where))
-    if any(len(pair) != 2 or pair[0] == pair[1] for pair in pairs):
-        raise LayoutError(f"{where} must be pairs of two different points")
-    return pairs
-
-
-def _points(value: object, where: str, index: dict[str, int]) -> tuple[int, ...]:
-    names = [_text(name, f"a point in {where}") for name in _list(value, where)]
-    unknown = [name for name in names if name not in index]
-    if unknown:
-        raise LayoutError(f"{where} names {_listed(unknown)}, not in names")
-    if not names:
-        raise LayoutError(f"{where} names no point")
-    return tuple(index[name] for name in names)
-
-
-def _mapping(value: object, where: str) -> dict:
-    if not isinstance(value, dict):
-        raise LayoutError(f"{where} must be a mapping, not {type(value).__name__}")
-    return value
-
-
-def _list(value: object, where: str) -> list:
-    if not isinstance(value, list):
-        raise LayoutError(f"{where} must be a list, not {type(value).__name__}")
-    return value
-
-
-def _text(value: object, where: str) -> str:
-    if not isinstance(value, str) or not value:
-        if isinstance(value, (bool, int, float)):  # what YAML makes of an unquoted `no` or `12`
-            raise LayoutError(f"{where} must be text, but YAML reads it as {_shown(value)}: put it in quotes")
-        raise LayoutError(f"{where} must be text, not {'empty' if value == '' else type(value).__name__}")
-    return value
-
-
-def _shown(value: object) -> str:
-    """A scalar for a message; Python refuses to print integers of thousands of digits."""
-    if isinstance(value, int) and value.bit_length() > 64:
-        return f"a number of {value.bit_length()} bits"
-    return repr(value)
-
-
-def _listed(names: list[str]) -> str:
-    """The first few of some names, for a message."""
-    rest = len(names) - 5
-    return ", ".join(f"'{name[:40]}'" for name in names[:5]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of known shapes under a true pinhole camera, from a start under weak perspective.
+"""The pose of known shapes under a true pinhole camera, refined from a weak-perspective start.
 
-Weak perspective lets every point of a person be as far away as its middle. Of a person 2 m away that is 10 cm and more
-of error, and of one seen from above a wrong slant. Orthographic-N-point gives the start, proven to be the best of its
-kind; from there Levenberg's and Marquardt's steps lower the error that the pinhole camera sees.
+Weak perspective takes all points of a person to be as far away as the person's middle.  At 2 m this costs 10 cm and
+more, and a person seen from above gets a wrong slant.  Orthographic-N-point gives the start, the proven optimum of
+weak perspective.  Levenberg-Marquardt steps from there lower the error of the pinhole camera.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-_STEPS = 2  # they leave a tenth of a pixel and a millimetre of a person 1.5 m away, a third nothing
+_STEPS = 2  # leave a tenth of a pixel and a millimetre for a person 1.5 m away; a third step leaves nothing
 _DAMPING = 1e-4
-_NEAREST = 0.05  # of the distance of a shape's origin: no point is taken to be nearer to the camera
+_LESS_DAMPING, _MORE_DAMPING = 0.1, 10.0  # factors after a step that lowered the error, or did not
+_NEAREST = 0.05  # share of the distance of a shape's origin: nearer points are moved there
 _TINY = 1e-300
 
 
 class PinholePose(NamedTuple):
-    """Poses of N shapes: ``X = R @ S + T`` in shape units, seen at ``X[:2] / X[2]``.
+    """Poses of N shapes: points ``X = R @ S + T`` in shape units have their images at ``X[:2] / X[2]``.
 
     Attributes:
         R: (N,3,3) det +1, canonical frame to camera frame.
         T: (N,3) shape units.
-        missed: (N,2,P) image points less what the poses give, normalised image units; nothing where hidden.
+        missed: (N,2,P) image points minus projected points, normalised image units; 0 where hidden.
     """
 
     R: np.ndarray
@@ -34,30 +35,45 @@ class PinholePose(NamedTuple):
 
 
 def refine(S: np.ndarray, W: np.ndarray, visible: np.ndarray, R: np.ndarray, T: np.ndarray) -> PinholePose:
-    """The least squares poses near (R, T), or these themselves where no step lowers the error.
+    """Refine poses by two damped Gauss-Newton steps (Levenberg-Marquardt).
 
     Args:
         S: (N,3,P) shapes.
-        W: (N,2,P) normalised image points (unit focal length); anything where hidden.
+        W: (N,2,P) normalised image points (unit focal length); any value where hidden.
         visible: (N,P) bool.
-        R, T: (N,3,3) and (N,3), the start.
+        R: (N,3,3) rotations of the start.
+        T: (N,3) translations of the start, shape units.
+
+    Returns:
+        Poses with a squared error that is smaller than the start's, or the start itself if no step lowers it.
     """
     W = np.where(visible[:, None], W, 0.0)
-    with np.errstate(all="ignore"):  # of images that no camera gives; no step from them is better
+    with np.errstate(all="ignore"):  # of images that no camera takes; no step lowers their error
         best, damping = _State.of(R, R @ S, T, W, visible), np.full((len(S), 1), _DAMPING)
         for _ in range(_STEPS):
+            # Solve the damped normal equations for a small turn and shift.
             turn, shift = _step(best, damping)
             tried = _State.of(turn @ best.R, turn @ best.Y, best.T + shift, W, visible)
+            # Keep the step where it lowers the error; adapt the damping of each person.
             better = tried.cost < best.cost
-            damping *= np.where(better, 0.1, 10.0)[:, None]
+            damping *= np.where(better, _LESS_DAMPING, _MORE_DAMPING)[:, None]
             best = tried if better.all() else _State(*map(_choose(better), tried, best))
         return PinholePose(best.R, best.T, best.error)
 
 
 class _State(NamedTuple):
-    """Poses, turned shapes Y (N,3,P), their image (N,2,P), inverse depths (N,P), what is missed (N,2,P), its cost.
+    """Poses of N shapes and their errors.
 
-    Hidden points are infinitely far away, and so at the image's origin, where W has them too: they add nothing.
+    Hidden points are infinitely far away, so their image is the origin.  W has them there too: they add nothing.
+
+    Attributes:
+        R: (N,3,3) rotations.
+        Y: (N,3,P) rotated shapes.
+        T: (N,3) translations.
+        image: (N,2,P) projected points.
+        inverse: (N,P) inverse depths.
+        error: (N,2,P) image points minus projected points.
+        cost: (N,) sum of squared errors.
     """
 
     R: np.ndarray
@@ -78,14 +94,15 @@ class _State(NamedTuple):
 
 
 def _choose(better: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return a function that takes rows of its first array where ``better`` (N,) holds, else of its second."""
     return lambda yes, no: np.where(better.reshape(-1, *(1,) * (yes.ndim - 1)), yes, no)
 
 
 def _step(pose: _State, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (N,3,3) and shifts (N,3) of one damped Gauss-Newton step.
+    """Return rotations (N,3,3) and shifts (N,3) of one damped Gauss-Newton step.
 
-    A shift t and a turn about a move a point Y + T by t + a x Y, and its image (u, v), with d its inverse depth, by
-    d times the first two parts of that less (u, v) times the third.
+    A shift t and a turn about a vector a move a point Y + T by m = t + a x Y.  With d the inverse depth, its image
+    (u, v) moves by d (m_xy - (u, v) m_z).
     """
     N, _, P = pose.Y.shape
     moved = (_TURNED @ pose.Y + _SHIFTED).reshape(N, 6, 3, P)
@@ -103,11 +120,11 @@ _CROSS = np.zeros((3, 3, 3))
 _CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]], _CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0, -1.0
 """a @ _CROSS is the matrix that takes Y to a x Y."""
 _SHIFTED, _TURNED = np.eye(6, 3).reshape(18, 1), np.vstack([np.zeros((9, 3)), _CROSS.reshape(9, 3)])
-"""How unit shifts along and turns about the three axes move a point Y: by _SHIFTED + _TURNED @ Y, three parts each."""
+"""Unit shifts along, and unit turns about, the three axes move a point Y by _SHIFTED + _TURNED @ Y (6 x 3 rows)."""
 _HALF_CROSS, _EYE = _CROSS.reshape(3, 9) / 2, np.eye(3)
 
 
 def _rotation(a: np.ndarray) -> np.ndarray:
-    """Cayley's rotations (N,3,3) about the vectors a (N,3), by their lengths up to the third order."""
+    """Return Cayley's rotations (N,3,3) about vectors a (N,3); the angle is |a| up to third order."""
     K = (a @ _HALF_CROSS).reshape(-1, 3, 3)
     return _EYE + (K + K @ K) * (2.0 / (1.0 + 0.25 * (a[:, None] @ a[:, :, None])))

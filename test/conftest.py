@@ -111,7 +111,8 @@ FOCAL, CENTRE = 600.0, (320.0, 240.0)
 def model_file(tmp_path_factory) -> Path:
     """A model file whose every shape is PERSON: its only weights that are not zero are the last bias."""
     from paul_ros.layout import load_layout
-    from paul_ros.model import save_model, to_unit_size, weight_shapes
+    from paul_ros.model_file import save_model, weight_shapes
+    from paul_ros.normalisation import to_unit_size
 
     layout = load_layout("coco17")
     shape = to_unit_size(PERSON.T[None], layout)[0]
@@ -138,7 +139,9 @@ def model_file(tmp_path_factory) -> Path:
 def coco_model():
     """The shipped model as one of COCO-17 alone: its weights for the other points left out."""
     from paul_ros.layout import load_layout
-    from paul_ros.model import Model, load_model, to_unit_size
+    from paul_ros.model import Model
+    from paul_ros.model_file import load_model
+    from paul_ros.normalisation import to_unit_size
 
     human, coco = load_model(), load_layout("coco17")
     own = np.array([human.layout.names.index(name) for name in coco.names])

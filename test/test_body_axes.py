@@ -10,7 +10,7 @@ import pytest
 from conftest import PERSON
 from scipy.spatial.transform import Rotation
 
-from paul_ros.body_axes import Steady, body_rotations, left_and_up, quaternions
+from paul_ros.body_axes import ContinuousSigns, body_rotations, left_and_up, quaternions
 from paul_ros.layout import Layout, load_layout
 
 COCO = load_layout("coco17")
@@ -84,7 +84,7 @@ def turning(count: int = 100) -> np.ndarray:
 
 
 def test_signs_do_not_jump_while_a_person_turns():
-    raw, steady = turning(), Steady()
+    raw, steady = turning(), ContinuousSigns()
     kept = np.array([steady(("7",), q[None])[0] for q in raw])
     assert (np.abs(np.diff(raw, axis=0)).max(axis=1) > 1).any()
     assert np.abs(np.diff(kept, axis=0)).max() < 0.1
@@ -92,7 +92,7 @@ def test_signs_do_not_jump_while_a_person_turns():
 
 
 def test_signs_of_persons_without_ids_or_unseen_start_anew():
-    raw, steady = turning(), Steady()
+    raw, steady = turning(), ContinuousSigns()
     np.testing.assert_array_equal([steady(("",), q[None])[0] for q in raw], raw)
     for q in raw:
         steady(("7",), q[None])
@@ -101,6 +101,6 @@ def test_signs_of_persons_without_ids_or_unseen_start_anew():
 
 
 def test_a_person_that_was_not_lifted_keeps_nan_and_is_forgotten():
-    steady = Steady()
+    steady = ContinuousSigns()
     assert np.isnan(steady(("7",), np.full((1, 4), np.nan))).all()
     assert steady(("7",), np.array([[0, 0, 0, 1.0]]))[0, 3] == 1

@@ -13,7 +13,7 @@ import pytest
 
 from paul_ros import cli, metrics
 from paul_ros.layout import load_layout
-from paul_ros.model import load_model, save_model
+from paul_ros.model_file import load_model, save_model
 from training.errors import DataError
 from training.judge import evaluation
 from training.judge.truth import Sequence, load_sequence, random_rotations

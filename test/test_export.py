@@ -10,8 +10,8 @@ from conftest import coco_model
 from scipy.spatial.transform import Rotation
 
 from paul_ros.layout import anonymous_layout, load_layout
-from paul_ros.model import load_model
-from paul_ros.onp import onp
+from paul_ros.model_file import load_model
+from paul_ros.orthographic_n_point import onp
 from training import export
 from training.categories import joint_layout
 from training.data import load_training_data

@@ -15,7 +15,7 @@ from PIL import Image
 from msg_adapters import outputs
 from paul_ros import cli
 from paul_ros.errors import BagError, PictureError
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.offline import film as view
 from paul_ros.offline.bag import BagMessages, BagWriter
 from paul_ros.offline.demo import find_bag

@@ -22,7 +22,7 @@ from msg_adapters import MessageError
 from msg_adapters.plugins import Adapter, Adapters
 from paul_ros.errors import ModelError
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.stream.stream import LiftStream
 
 SCRIPT = Path(__file__).resolve().parent.parent / "benchmarks/fuzz.py"

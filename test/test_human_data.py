@@ -17,7 +17,7 @@ from test_distributed import TORCHRUN
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import LayoutError
 from paul_ros.layout import load_layout
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.placement import centred_view
 from training import command as cli
 from training.data import load_training_data

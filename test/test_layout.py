@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paul_ros.errors import LayoutError
-from paul_ros.layout import Handedness, Layout, anonymous_layout, layout_names, load_layout, middles
+from paul_ros.layout import Handedness, Layout, anonymous_layout, layout_names, load_layout, midpoints
 
 POINTS = {
     "body25": 25,
@@ -372,13 +372,13 @@ def test_categories_round_trip_and_hold_every_point_once():
             Layout.from_dict({**data, "categories": wrong})
 
 
-def test_middles_of_other_points():
+def test_midpoints_of_other_points():
     human = load_layout("human")
     place = {name: index for index, name in enumerate(human.names)}
-    assert middles(human) == {
+    assert midpoints(human) == {
         place[middle]: (place[f"left_{part}"], place[f"right_{part}"])
         for middle, part in (("pelvis", "hip"), ("neck", "shoulder"))
     }
-    assert middles(load_layout("coco17")) == {}
+    assert midpoints(load_layout("coco17")) == {}
     animal = Layout.from_dict({"name": "dog", "names": ["left_shoulder", "neck", "right_shoulder"], "root": "neck"})
-    assert middles(animal) == middles(replace(animal, name="human")) == {}
+    assert midpoints(animal) == midpoints(replace(animal, name="human")) == {}

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import ModelError
 from paul_ros.layout import load_layout
-from paul_ros.lifter import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS, Lifter
-from paul_ros.model import load_model
+from paul_ros.lifted import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS
+from paul_ros.lifter import Lifter
+from paul_ros.model_file import load_model
 from paul_ros.placement import centred_view
 
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)

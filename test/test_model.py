@@ -13,17 +13,9 @@ import pytest
 
 from paul_ros.errors import ModelError
 from paul_ros.layout import load_layout
-from paul_ros.model import (
-    Model,
-    centre,
-    enough_visible,
-    load_model,
-    model_names,
-    normalise,
-    save_model,
-    to_unit_size,
-    weight_shapes,
-)
+from paul_ros.model import Model
+from paul_ros.model_file import load_model, model_names, save_model, weight_shapes
+from paul_ros.normalisation import centre, enough_visible, normalise, to_unit_size
 
 LAYOUT = load_layout("coco17")
 
@@ -296,7 +288,8 @@ def test_forward_pass_equals_torch(saved):
     """In a process of its own: torch must not enter the process of the runtime's tests."""
     code = f"""
 import numpy as np, torch
-from paul_ros.model import load_model, normalise
+from paul_ros.model_file import load_model
+from paul_ros.normalisation import normalise
 from training.networks import build_networks
 from training.recipe import Recipe
 model = load_model({str(saved)!r})

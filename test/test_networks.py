@@ -9,17 +9,8 @@ from hypothesis import strategies as st
 
 from paul_ros.errors import ModelError
 from paul_ros.layout import Layout, anonymous_layout, load_layout
-from paul_ros.model import (
-    check_size,
-    dictionary_sizes,
-    load_model,
-    normalise,
-    save_model,
-    to_centre,
-    to_unit_size,
-    upright,
-    weight_shapes,
-)
+from paul_ros.model_file import check_size, dictionary_sizes, load_model, save_model, weight_shapes
+from paul_ros.normalisation import normalise, to_centre, to_unit_size, upright
 from training import networks as networks_module
 from training.export import architecture
 from training.networks import build_networks, main_axes

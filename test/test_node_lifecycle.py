@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from node_bench import MAKE, Bench, good, header_of, set_parameters
 
-from paul_ros.model import load_model, save_model
+from paul_ros.model_file import load_model, save_model
 
 
 class Managed(Bench):

@@ -13,7 +13,9 @@ from naive_onp import centred, naive_residual, rms
 from scipy.spatial.transform import Rotation
 
 from paul_ros import viewing_sphere
-from paul_ros.onp import _Points, onp
+from paul_ros.arithmetic import Floats, cross_of_parts
+from paul_ros.orthographic_n_point import _Points, onp
+from paul_ros.viewing_goal import Problem, view_along
 from paul_ros.viewing_sphere import solve
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -525,15 +527,15 @@ def test_goal_has_the_derivatives_that_the_climb_goes_by(scale):
     rng = np.random.default_rng(30)
     a, d = np.sort(rng.random(3)), rng.standard_normal(3) + 1j * rng.standard_normal(3)
     a, d = tuple((a / a.sum()).tolist()), tuple((d / 3).tolist())
-    problem = viewing_sphere.Problem(a, d, viewing_sphere._cross_of_parts(d), 0.4)
+    problem = Problem(a, d, cross_of_parts(d), 0.4)
     n = rng.standard_normal(3)
     n = tuple((n / np.linalg.norm(n)).tolist())
-    at = viewing_sphere._view(viewing_sphere._Floats, problem, n, scale)
+    at = view_along(Floats, problem, n, scale)
     step = 1e-4
     for way in (1, 1j, (1 + 1j) / 2**0.5):
         along = np.array([(np.conj(way) * u).real for u in at.u])
         near = [np.cos(h) * np.array(n) + np.sin(h) * along for h in (-step, step)]
-        low, high = (viewing_sphere._view(viewing_sphere._Floats, problem, tuple(x), scale).g for x in near)
+        low, high = (view_along(Floats, problem, tuple(x), scale).g for x in near)
         assert (high - low) / (2 * step) == pytest.approx((np.conj(way) * at.slope).real, abs=1e-6)
         bend = at.m + (at.w * np.conj(way) ** 2).real
         assert (high - 2 * at.g + low) / step**2 == pytest.approx(bend, abs=1e-5)
@@ -545,11 +547,11 @@ def test_a_direction_beside_the_optimum_is_not_certified(scale):
     for _ in range(50):
         d = rng.standard_normal(3) + 1j * rng.standard_normal(3)
         d = tuple((d / np.linalg.norm(d) / 2).tolist())
-        problem = viewing_sphere.Problem((0.1, 0.3, 0.6), d, viewing_sphere._cross_of_parts(d), 0.5)
-        best = viewing_sphere._solve(viewing_sphere._Floats, problem, scale)
+        problem = Problem((0.1, 0.3, 0.6), d, cross_of_parts(d), 0.5)
+        best = viewing_sphere._solve(Floats, problem, scale)
         beside = np.array(best.best.n) + 1e-7 * rng.standard_normal(3)
-        view = viewing_sphere._view(viewing_sphere._Floats, problem, tuple(beside / np.linalg.norm(beside)), scale)
-        assert best.certified and not viewing_sphere._certified(viewing_sphere._Floats, problem, view, scale)
+        view = view_along(Floats, problem, tuple(beside / np.linalg.norm(beside)), scale)
+        assert best.certified and not viewing_sphere.is_certified(Floats, problem, view, scale)
 
 
 @pytest.mark.parametrize("batch", [1, 17, 400, 4000])

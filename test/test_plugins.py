@@ -19,7 +19,7 @@ from node_bench import Bench
 import msg_adapters
 from msg_adapters import Adapter, Keypoints2D, MessageError, WrongPointCount, plugins, record
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.offline.bag import BagMessages, BagWriter
 from paul_ros.stream.stream import LiftStream
 

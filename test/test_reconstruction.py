@@ -14,7 +14,7 @@ from tiny_data import centred, sequence, true_start
 from paul_ros import cli as paul
 from paul_ros.errors import BagError
 from paul_ros.metrics import normalised_error
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from training import command as cli
 from training import reconstruction
 from training.encoder_fit import fit_encoder

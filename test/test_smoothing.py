@@ -9,17 +9,21 @@ import numpy as np
 import pytest
 from conftest import PERSON
 
-from paul_ros.lifter import _nothing
+from paul_ros.layout import load_layout
+from paul_ros.lifted import TOO_FEW_POINTS, Lifted
 from paul_ros.stream.smoothing import FORGET_SECONDS, OneEuro
 
 HIPS = (11, 12)
 FRAME = 33_333_333  # ns
 
 
+def nobody(persons: int = 1, units: str = "m") -> Lifted:
+    return Lifted.nobody((TOO_FEW_POINTS,) * persons, load_layout("coco17"), units)
+
+
 def lifted(points: np.ndarray, units: str = "m"):
     """Persons (N,17,3) as the Lifter gives them."""
-    nobody = _nothing(len(points), 17, units)
-    return replace(nobody, points=points, root=points[:, HIPS].mean(1), reason=("",) * len(points))
+    return replace(nobody(len(points), units), points=points, root=points[:, HIPS].mean(1), reason=("",) * len(points))
 
 
 def run(filtered: OneEuro, frames: np.ndarray, ids=("1",), start: int = 0) -> np.ndarray:
@@ -86,7 +90,7 @@ def test_persons_without_an_id_or_not_lifted_are_as_they_were():
     np.testing.assert_array_equal(run(OneEuro(1.0), raw, ("",)), raw)
     filtered = OneEuro(1.0)
     for n in range(3):
-        assert np.isnan(filtered(("1",), n * FRAME, _nothing(1, 17, "m"), HIPS).points).all()
+        assert np.isnan(filtered(("1",), n * FRAME, nobody(), HIPS).points).all()
 
 
 def test_the_root_is_that_of_the_filtered_points():

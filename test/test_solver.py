@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 from training.solver import algebraic_camera, centre, solve_camera
 
 SCALES = ("free", "unit")

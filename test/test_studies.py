@@ -13,7 +13,7 @@ import pytest
 
 from paul_ros import cli
 from paul_ros.layout import anonymous_layout
-from paul_ros.model import load_model, save_model, weight_shapes
+from paul_ros.model_file import load_model, save_model, weight_shapes
 from training import reconstruction
 from training.categories import joint_layout
 from training.judge.studies import interpolation

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tiny_data import sequence, true_start
 
 from paul_ros.layout import load_layout
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 from training import trainer
 from training.encoder_fit import fit_encoder
 from training.errors import RecipeError, TrainingError

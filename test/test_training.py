@@ -17,7 +17,7 @@ from tiny_data import FROM_RANDOM_WEIGHTS
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros.errors import BagError, ModelError
 from paul_ros.layout import load_layout
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records
 from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import open_stream

@@ -19,7 +19,7 @@ import msg_adapters
 from paul_ros.errors import LayoutError, NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout, anonymous_layout, load_layout
-from paul_ros.model import centre, enough_visible, min_visible
+from paul_ros.normalisation import centre, enough_visible, min_visible
 from paul_ros.placement import centred_view
 from paul_ros.stream.parameters import DEFAULTS
 from training.errors import DataError

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from paul_ros.layout import Layout, Part
-from paul_ros.model import CONVOLUTIONAL, RESIDUAL, dictionary_sizes
+from paul_ros.model import CONVOLUTIONAL, RESIDUAL
+from paul_ros.model_file import dictionary_sizes
 from training.recipe import Recipe
 
 _FREE_CODE_SIZE = 0.1

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from paul_ros.files import write_atomically
 from paul_ros.layout import Layout
-from paul_ros.model import enough_visible
+from paul_ros.normalisation import enough_visible
 from training.data import TrainingData
 from training.distributed import Share, from_first, is_first, processes, share_of
 from training.errors import StartError, TrainingError

@@ -20,8 +20,8 @@ import numpy as np
 from paul_ros import __version__
 from paul_ros.benchmarks import rivals
 from paul_ros.benchmarks.naive import naive_optimum
-from paul_ros.model import load_model
-from paul_ros.onp import onp
+from paul_ros.model_file import load_model
+from paul_ros.orthographic_n_point import onp
 
 METHODS: dict[str, Callable] = {
     "ours": onp,

@@ -174,7 +174,7 @@ def _seconds(text: str) -> float:
 
 
 def _view(args: argparse.Namespace) -> None:
-    from paul_ros.model import load_model
+    from paul_ros.model_file import load_model
     from paul_ros.offline.bag import check_outputs
     from paul_ros.offline.film import view_bag, view_model
     from paul_ros.offline.replay import Topics

@@ -25,7 +25,7 @@ from paul_ros.body_axes import body_rotations, left_and_up
 from paul_ros.errors import BagError, PictureError
 from paul_ros.files import write_atomically
 from paul_ros.layout import Layout
-from paul_ros.lifter import AMBIGUOUS
+from paul_ros.lifted import AMBIGUOUS
 from paul_ros.model import Model
 from paul_ros.offline.bag import BagWriter, Record, matches, read_records
 from paul_ros.offline.replay import LiftedFrame, Replay, Topics, replay

@@ -22,7 +22,8 @@ from msg_adapters.keypoints import stamp_ns
 from paul_ros import __version__, metrics
 from paul_ros.errors import BagError, WriteError, WrongTopicError
 from paul_ros.layout import Layout
-from paul_ros.lifter import AMBIGUOUS, Lifted, Lifter
+from paul_ros.lifted import AMBIGUOUS, Lifted
+from paul_ros.lifter import Lifter
 from paul_ros.offline.bag import (
     LATCHED_QOS,
     BagMessages,

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from paul_ros.lifter import AMBIGUOUS
+from paul_ros.lifted import AMBIGUOUS
 from paul_ros.stream.stream import Frame, LiftStream
 
 #: Levels, by the numbers of diagnostic_msgs/DiagnosticStatus.

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from msg_adapters import DepthImage, Intrinsics
-from paul_ros.lifter import Lifted
+from paul_ros.lifted import Lifted
 
 SURFACE = 0.12
 """Metres that the middle of people's hips lies behind the skin that is measured, half of the depth of adults there,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from paul_ros.lifter import Lifted
+from paul_ros.lifted import Lifted
 
 SPEED_COEFFICIENT = 2.0
 """Hz that the cut-off rises by at a speed of one size per second; a person's size is the rms distance of its points

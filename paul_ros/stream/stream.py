@@ -21,13 +21,15 @@ import numpy as np
 import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPointCount, outputs
 from msg_adapters.cdr import CloudReader, CloudWriter, PoseArrayWriter
-from paul_ros.body_axes import Steady, body_rotations, left_and_up, quaternions
+from paul_ros.body_axes import ContinuousSigns, body_rotations, left_and_up, quaternions
 from paul_ros.layout import Layout, layout_names, load_layout
-from paul_ros.lifter import BEHIND_CAMERA, DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted, Lifter
-from paul_ros.model import load_model
+from paul_ros.lifted import BEHIND_CAMERA, DEGENERATE_POINTS, MAX_DISTANCE, TOO_FAR, TOO_FEW_POINTS, Lifted
+from paul_ros.lifter import Lifter
+from paul_ros.model_file import load_model
+from paul_ros.route import MODEL, Route
 from paul_ros.stream.depth import SURFACE, Depths
 from paul_ros.stream.parameters import checked
-from paul_ros.stream.route import MODEL, Route, read_unknown
+from paul_ros.stream.route import read_unknown
 from paul_ros.stream.smoothing import OneEuro
 
 #: Lift times kept for the median and the 99th percentile: the last half minute at 30 Hz.
@@ -222,7 +224,7 @@ class LiftStream:
         self._image_size: tuple[int, int] | None = None
         self._camera_frame = ""
         self._gathered = _Gathered()
-        self._measures, self._steady = left_and_up(lifter.model.layout), Steady()
+        self._measures, self._steady = left_and_up(lifter.model.layout), ContinuousSigns()
         self._bone_width = _BONE_WIDTH * float(np.ptp(lifter.model.mean_shape, axis=1).max())
         self._filter = OneEuro(smoothing)
         self._depths = Depths()

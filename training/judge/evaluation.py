@@ -16,10 +16,11 @@ import numpy as np
 from paul_ros import metrics
 from paul_ros.errors import ModelError, NpzError
 from paul_ros.files import read_npz
-from paul_ros.lifter import AMBIGUOUS, DEGENERATE_POINTS, TOO_FEW_POINTS
-from paul_ros.model import Model, load_model
+from paul_ros.lifted import AMBIGUOUS, DEGENERATE_POINTS, TOO_FEW_POINTS
+from paul_ros.model import Model
+from paul_ros.model_file import load_model
 from paul_ros.offline.replay import versions
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 from training.categories import among_categories
 from training.errors import DataError
 from training.judge.truth import Sequence, load_sequence

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from paul_ros import __version__
 from paul_ros.files import write_atomically
 from paul_ros.layout import anonymous_layout
-from paul_ros.model import enough_visible
+from paul_ros.normalisation import enough_visible
 from training import reconstruction
 from training.data import TrainingData, load_training_data
 from training.errors import DataError, RecipeError

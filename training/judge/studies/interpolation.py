@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.model import Model, load_model, normalise
+from paul_ros.model import Model
+from paul_ros.model_file import load_model
+from paul_ros.normalisation import normalise
 from paul_ros.offline.replay import versions
 from paul_ros.offline.report import write_json
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 from training.categories import among_categories
 from training.data import load_training_data
 from training.errors import DataError

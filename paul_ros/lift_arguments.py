@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arguments of ``Lifter.lift``: checked, and converted to arrays and intrinsics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from msg_adapters.camera_info import read_camera_info
+from msg_adapters.keypoints import Intrinsics, MessageError
+from paul_ros.errors import InputError
+from paul_ros.layout import Layout, layout_names, load_layout
+
+_FOCAL_LENGTHS = (10.0, 1e6)
+"""Pixels, limits of plausible focal lengths; a normalised K is below them."""
+
+
+def as_points(points: Any, visible: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Convert 2D points and their visibility to arrays.
+
+    Args:
+        points: (N,P,2) or (P,2) pixels, any array or nested list.
+        visible: (N,P) or (P,) bool, or 0 and 1; None for all points with finite coordinates.
+        layout: layout of the P points.
+
+    Returns:
+        Points (N,P,2) float64 and visibility (N,P) bool; N = 1 for points (P,2).
+
+    Raises:
+        InputError: a shape or type is wrong; the text says what to pass instead.
+    """
+    xy = _as_floats(points, "points")
+    if xy.ndim == 2:
+        xy = xy[None]
+        visible = None if visible is None else np.asarray(visible)[None]
+    P = len(layout.names)
+    if xy.ndim != 3 or xy.shape[1:] != (P, 2):
+        raise InputError(
+            f"points have shape {np.shape(points)}, layout '{layout.name}' needs (N,{P},2), or ({P},2) for one "
+            f"person{_advice(xy, layout)}"
+        )
+    if visible is None:
+        return xy, np.isfinite(xy).all(2)
+    return xy, _as_visibility(visible, xy)
+
+
+def as_intrinsics(camera: Any) -> Intrinsics | None:
+    """Convert a camera to intrinsics.
+
+    Args:
+        camera: Intrinsics, a 3x3 camera matrix K in pixels (array or nested list), or a sensor_msgs/CameraInfo of any
+            message library; None stays None.
+
+    Raises:
+        InputError: the camera is none of these, or has implausible values.
+    """
+    if camera is None or isinstance(camera, Intrinsics):
+        return camera
+    if hasattr(camera, "k") and hasattr(camera, "p"):
+        try:
+            return read_camera_info(camera)
+        except MessageError as error:
+            raise InputError(str(error)) from None
+    K = _as_floats(camera, "camera")
+    if K.shape != (3, 3):
+        raise InputError(
+            f"camera has shape {K.shape}: pass Intrinsics, a 3x3 camera matrix K in pixels, or a sensor_msgs/CameraInfo"
+        )
+    (fx, skew, cx), (zero, fy, cy), last = K.tolist()
+    low, high = _FOCAL_LENGTHS
+    plausible = low <= fx <= high and low <= fy <= high and np.isfinite([cx, cy]).all()
+    if skew or zero or last != [0, 0, 1] or not plausible:
+        raise InputError(
+            f"camera {K.tolist()} is no camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with focal lengths from "
+            f"{low:g} to {high:g} pixels: pass the K of the rectified image, not normalised, without skew"
+        )
+    return Intrinsics(fx, fy, cx, cy, 0, 0, matrix="K")
+
+
+def _as_visibility(visible: Any, xy: np.ndarray) -> np.ndarray:
+    seen = np.asarray(visible)
+    if seen.shape != xy.shape[:2]:
+        raise InputError(f"visible has shape {seen.shape}, points {xy.shape} need {xy.shape[:2]}")
+    if seen.dtype != bool:
+        if seen.dtype.kind not in "iuf" or not ((seen == 0) | (seen == 1)).all():
+            raise InputError("visible must be true or false: compare confidences with a threshold, as in scores > 0.3")
+        seen = seen.astype(bool)
+    return seen
+
+
+def _as_floats(values: Any, name: str) -> np.ndarray:
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} of type {type(values).__name__} cannot be an array of numbers: {error}") from None
+
+
+def _advice(xy: np.ndarray, layout: Layout) -> str:
+    """Return what to change about points of a wrong shape, as the end of an error; '' if nothing comes to mind."""
+    P = len(layout.names)
+    if xy.ndim != 3:
+        return ""
+    if xy.shape[2] == 3:
+        return ": pass x and y as points[..., :2], and confidences as visible=points[..., 2] > 0.3"
+    if xy.shape[1:] == (2, P):
+        return ": transpose them"
+    fitting = [name for name in layout_names() if (len(load_layout(name).names), 2) == xy.shape[1:]]
+    if not fitting:
+        return ""
+    return f": name their layout, as in layout='{fitting[0]}'; these have so many points: {', '.join(fitting)}"
