@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 from dataclasses import replace
 
@@ -167,7 +166,17 @@ def test_mapping_onto_itself_changes_nothing() -> None:
         np.testing.assert_array_equal(out, given_array)
 
 
-@pytest.mark.parametrize("source, target", itertools.permutations(POINTS, 2))
+@pytest.mark.parametrize(
+    "source, target",
+    [
+        ("coco17", "body25"),  # derived points
+        ("body25", "coco17"),  # points left out
+        ("hri18", "openpose18"),  # another order
+        ("h36m17", "mediapipe33"),  # few points in common
+        ("cmu31", "human"),  # most points lacking
+        ("human", "h36m17"),
+    ],
+)
 def test_mapping_goes_by_name(source: str, target: str) -> None:
     """Each point lands under its own name, or is hidden; nothing lands elsewhere."""
     source_layout, target_layout = load_layout(source), load_layout(target)

@@ -5,16 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import coco_model, persons_at
+from conftest import PERSON, coco_model, persons_at
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.keypoints import Intrinsics
+from paul_ros import shape_fit
 from paul_ros.errors import ModelError
 from paul_ros.layout import load_layout
 from paul_ros.lifted import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.placement import centred_view
+from paul_ros.shape_fit import fit_shapes
 
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)
 
@@ -265,6 +267,15 @@ def test_the_virtual_camera_looks_at_the_person():
     np.testing.assert_allclose(view.W, seen[:, :2] / seen[:, 2:], atol=1e-9)
 
 
+@pytest.mark.parametrize("degrees, seen", [(58, True), (59.9, True), (60.1, False), (62, False)])
+def test_points_farther_than_60_degrees_from_the_person_are_misdetections(degrees, seen):
+    """Two of them, one on each side, so that the person's direction stays where the other points are."""
+    xy = np.full((1, 17, 2), (CAMERA.cx, CAMERA.cy))
+    xy[0, :2, 0] += np.array([-1, 1]) * CAMERA.fx * np.tan(np.radians(degrees))
+    view = centred_view(xy, everything(xy), CAMERA)
+    np.testing.assert_array_equal(view.seen[0], [seen, seen] + [True] * 15)
+
+
 def test_one_wild_detection_does_not_turn_the_virtual_camera_away(model):
     truth = standing(model, [0.5, 0, 5])
     xy = pinhole(truth)
@@ -291,6 +302,20 @@ def test_what_a_detector_got_wrong_is_not_used(exact_lifter, camera):
     hidden = visible.copy()
     hidden[0, 9] = False
     np.testing.assert_allclose(lifted.points, exact_lifter.lift(xy, hidden, camera).points, atol=1e-4)
+
+
+def test_points_that_miss_by_more_than_35_percent_of_the_extent_are_misdetections(exact_lifter):
+    """A hip moved away step by step; the share is that of the fit with all points."""
+    model, count = exact_lifter.model, 60
+    W = np.repeat(PERSON.T[None, :2], count, axis=0)
+    W[:, 0, 11] += np.linspace(0.1, 0.8, count)
+    visible = np.ones((count, 17), bool)
+    fit = shape_fit._fit(model, W, visible, pinhole=False)
+    share = np.sqrt(fit.square[:, 11]) / fit.extent
+    assert ((share > 0.33) & (share < 0.35)).any() and ((share > 0.35) & (share < 0.37)).any()
+    used = fit_shapes(model, W, visible, pinhole=False).used
+    np.testing.assert_array_equal(used[:, 11], share <= 0.35)
+    assert np.delete(used, 11, axis=1).all()
 
 
 def test_points_that_all_fit_are_all_used(exact_lifter):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from paul_ros import viewing_sphere
 from paul_ros.arithmetic import Floats, cross_of_parts
 from paul_ros.orthographic_n_point import _Points, onp
-from paul_ros.viewing_goal import Problem, view_along
+from paul_ros.viewing_goal import Problem, newton, view_along
 from paul_ros.viewing_sphere import solve
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -382,6 +382,17 @@ def test_planar_shapes_are_ambiguous_unless_seen_face_on(scale, count):
 
 @BOTH_SCALES
 @BATCHES
+@pytest.mark.parametrize("apart, two_fold", [(0.048, False), (0.052, True)])
+def test_optima_closer_than_a_twentieth_radian_are_one(scale, count, apart, two_fold):
+    """A plane tilted by an angle has two exact poses, whose viewing directions are twice that angle apart."""
+    S = np.random.default_rng(19).standard_normal((count, 3, 12))
+    S[:, 2] = 0
+    W = Rotation.from_euler("x", apart / 2).as_matrix()[:2] @ S
+    assert (onp(S, W, None, scale).two_fold == two_fold).all()
+
+
+@BOTH_SCALES
+@BATCHES
 def test_deep_shapes_with_little_noise_are_not_ambiguous(scale, count):
     S, W, _ = random_problems(count, 30, 0.02, seed=14)
     found = onp(S, W, None, scale)
@@ -497,9 +508,9 @@ def test_any_numbers_at_all_give_numbers(scale, batch, points, seed, data):
 
 
 @BOTH_SCALES
-@pytest.mark.parametrize("count", [0, 1, 20])
-@pytest.mark.parametrize("points", [0, 1, 2])
-@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize(
+    "count, points, weighted", [(0, 0, True), (1, 0, False), (1, 2, True), (20, 0, True), (20, 1, False)]
+)
 def test_too_few_points(scale, count, points, weighted):
     weights = np.ones((count, points)) if weighted else None
     found = onp(np.ones((count, 3, points)), np.ones((count, 2, points)), weights, scale)
@@ -539,6 +550,22 @@ def test_goal_has_the_derivatives_that_the_climb_goes_by(scale):
         assert (high - low) / (2 * step) == pytest.approx((np.conj(way) * at.slope).real, abs=1e-6)
         bend = at.m + (at.w * np.conj(way) ** 2).real
         assert (high - 2 * at.g + low) / step**2 == pytest.approx(bend, abs=1e-5)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_newton_step_turns_the_view_by_at_most_39_degrees(scale):
+    """Its tangent is at most 0.8, or climbs leave their hill; a smaller limit would cost steps."""
+    rng = np.random.default_rng(35)
+    angles = []
+    for _ in range(300):
+        a, d = np.sort(rng.random(3)), rng.standard_normal(3) + 1j * rng.standard_normal(3)
+        a, d = tuple((a / a.sum()).tolist()), tuple((0.8 * d / np.linalg.norm(d)).tolist())
+        n = rng.standard_normal(3)
+        n = tuple((n / np.linalg.norm(n)).tolist())
+        after = newton(Floats, Problem(a, d, cross_of_parts(d), 0.5), n, scale, steps=1).n
+        angles.append(np.arctan2(np.linalg.norm(np.cross(n, after)), np.dot(n, after)))
+    assert max(angles) == pytest.approx(np.arctan(0.8), abs=1e-9)
+    assert 0.2 < np.mean(np.isclose(angles, np.arctan(0.8))) < 0.9
 
 
 @pytest.mark.parametrize("scale", SCALES)

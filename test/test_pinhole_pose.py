@@ -71,6 +71,35 @@ def test_the_optimum_is_that_of_a_naive_solver(monkeypatch):
         assert found[row] == pytest.approx(2 * naive.cost, rel=1e-6)
 
 
+def test_steps_from_far_starts_are_damped_until_they_help(monkeypatch):
+    """A tenth of the damping after a step that lowered the error, ten times as much after one that did not."""
+    monkeypatch.setattr(module, "_STEPS", 8)
+    S, W, visible, _, far, _, _ = problems(noise=0.1, seed=1)
+    wild = Rotation.random(len(S), random_state=10).as_matrix()
+    dampings, step = [], module._step
+    monkeypatch.setattr(module, "_step", lambda pose, damping: step(pose, dampings.append(damping.copy()) or damping))
+    before = np.where(visible[:, None], W - image(S, wild, far), 0.0)
+    assert (cost(refine(S, W, visible, wild, far).missed) < cost(before)).all()
+    factors = np.array(dampings[1:]) / np.array(dampings[:-1])
+    np.testing.assert_allclose(dampings[0], 1e-4)
+    assert np.isclose(factors, 10).any() and np.isclose(factors, 0.1).any()
+    assert (np.isclose(factors, 10) | np.isclose(factors, 0.1)).all()
+
+
+def test_the_search_goes_on_after_a_step_that_does_not_help(monkeypatch):
+    """Such a step is not taken, and the next ones are damped more, until one helps."""
+    S, W, visible, _, far, _, _ = problems(noise=0.1, seed=1)
+    wild = Rotation.random(len(S), random_state=10).as_matrix()
+    costs = []
+    for steps in range(12):
+        monkeypatch.setattr(module, "_STEPS", steps)
+        costs.append(cost(refine(S, W, visible, wild, far).missed))
+    costs = np.array(costs)
+    failed = costs[1:] == costs[:-1]
+    recovered = failed[:-1] & (costs[2:] < costs[1:-1])
+    assert recovered.any(0).sum() > 5
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_no_start_is_made_worse(seed):
     """Starts that are far off, too."""
