@@ -30,8 +30,8 @@ _MAX_BYTES = 1_000_000
 class Handedness:
     """A rule of anatomy that distinguishes a shape from its mirror image; each attribute holds point indices.
 
-    With m(.) the mean of points, (m(left) - m(right)) x (m(above) - m(below)) points along m(front) - m(behind) in
-    any right-handed frame: left x up = forward, as in REP-103's body frame.
+    Let m(.) be the mean of points.  Then (m(left) - m(right)) x (m(above) - m(below)) points along
+    m(front) - m(behind) in any right-handed frame.  This is left x up = forward, as in REP-103's body frame.
     """
 
     left: Points

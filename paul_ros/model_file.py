@@ -49,6 +49,8 @@ def load_model(name_or_path: str | os.PathLike[str] = DEFAULT_MODEL) -> Model:
         ModelError: there is no such model, or the file is unreadable, damaged, of another format version, or not a
             model file.
     """
+    if not isinstance(name_or_path, (str, os.PathLike)):
+        raise ModelError(f"model is a {type(name_or_path).__name__}: pass a name or the path of a model file")
     name, data = _read(name_or_path)
     where = f"model file '{name_or_path}'"
     digest = _verified_digest(data, where)

@@ -66,7 +66,7 @@ def upright(W: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Turn image points into one standard orientation, and mirror them to one side.
 
     To an orthographic camera a turned image is one of a camera that rolled, and a mirrored image is one from behind.
-    Neither changes the shape, so the encoder need not learn them.
+    The shape is the same, so the encoder need not learn them.
 
     Args:
         W: (N,2,P) image points.

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Orthographic-N-point: the rotation (and scale) that best project a known shape onto its 2D points.
 
-``onp`` minimises ``sum_j w_j |s R_xy S_j + t - W_j|^2`` over rotations R, translations t and, in the free-scale
-problem, s > 0.  ``docs/onp.md`` reduces this to a smooth function on the sphere of viewing directions and derives the
-proof of global optimality.  ``paul_ros.viewing_sphere`` has the solver; ``paul benchmark onp`` measures it.
+The function ``onp`` minimises ``sum_j w_j |s R_xy S_j + t - W_j|^2`` over rotations R, translations t and, in the
+free-scale problem, s > 0.
+
+The page ``docs/onp.md`` reduces this to a smooth function on the sphere of viewing directions and derives the
+proof of global optimality.  The module ``paul_ros.viewing_sphere`` has the solver; ``paul benchmark onp`` measures it.
 """
 
 from __future__ import annotations
@@ -34,10 +36,10 @@ class OnP(NamedTuple):
             mean squared distance by more than 1e-10 of the image's mean square about its mean.  In the unit-scale
             problem this share refers to image and shape together.  For shapes next to needles or balls and images
             next to lines, rounding makes it 1e-7.
-        determined: (N,) bool, the points fix a pose.  They do not in these cases: fewer than three points; all on one
-            line; an image without correlation to the shape; an extent below 1e-12 of the distance from the origin,
-            below 1e-70 or beyond 1e150; a coordinate or weight that is not finite; a negative weight.  R is then the
-            identity and scale 0 (1 in the unit-scale problem).
+        determined: (N,) bool, the points fix a pose; otherwise R is the identity and scale 0 (1 in the unit-scale
+            problem).  They fix none if fewer than three are given, if all are on one line, or if shape and image are
+            uncorrelated.  Extents must be at least 1e-12 of the distance from the origin, and from 1e-70 to 1e150.
+            Coordinates and weights must be finite, and weights not negative.
         two_fold: (N,) bool, a second, depth-reversed optimum was found, and its viewing direction is more than 0.05
             radians from the first.  At most 0.4 % of the existing ones are missed (docs/onp.md).
         R_mirror, scale_mirror, translation_mirror, residual_mirror: the second optimum; without one, the Necker

@@ -13,8 +13,8 @@ from paul_ros.orthographic_n_point import onp
 from paul_ros.pinhole_pose import refine
 
 _WILD_MEDIANS, _WILD_EXTENT = 3.0, 0.35
-"""A point is a misdetection if it misses the fitted shape by more than so many medians of the person's points, and by
-more than this share of the person's extent (about 11 % of the height)."""
+"""Limits of misses, in medians of the person's points and as a share of the person's extent (about 11 % of the
+height).  A point that exceeds both is a misdetection."""
 
 
 class ShapeFit(NamedTuple):

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Orthographic-N-point, reduced to the viewing direction n and solved on the sphere of directions.
 
-``paul_ros.viewing_goal`` has the goal g(n) and the climb.  The best pose that looks along n is ``r1 + i r2 = u z/|z|``,
-and the best n has the largest g.  ``docs/onp.md`` has the derivation and the proof of the certificate.
+The module ``paul_ros.viewing_goal`` has the goal g(n) and the climb.  The best pose that looks along n is
+``r1 + i r2 = u z/|z|``, and the best n has the largest g.  The page ``docs/onp.md`` derives this and proves the
+certificate.
 """
 
 from __future__ import annotations

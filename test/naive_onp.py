@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The naive twin of ``paul_ros.onp``: Levenberg-Marquardt over rotation vectors from several starts.
+"""A naive orthographic-N-point solver: Levenberg-Marquardt over rotation vectors from several starts.
 
-It works on the points themselves and shares neither a formula nor a line with the solver that it judges.
+It works on the points themselves and shares neither a formula nor a line with ``paul_ros.onp``, which it judges.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ STARTS = Rotation.random(8, random_state=0).as_rotvec()
 
 
 def centred(points: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Points (D,P) about their mean under weights (P,)."""
+    """Return points (D,P) minus their mean under weights (P,)."""
     return points - np.average(points, axis=1, weights=w)[:, None]
 
 
 def rms(points: np.ndarray, w: np.ndarray) -> float:
-    """Weighted root mean square length of vectors (D,P) under weights (P,)."""
+    """Return the weighted rms length of vectors (D,P) under weights (P,)."""
     return float(np.sqrt(np.average((points**2).sum(0), weights=w)))
 
 
 def naive_residual(S: np.ndarray, W: np.ndarray, w: np.ndarray, scale: str) -> float:
-    """The smallest weighted root mean square distance that the search finds, in image units.
+    """Return the smallest weighted rms distance that the search finds, in image units.
 
     Args:
         S: (3,P) shape.

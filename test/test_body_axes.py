@@ -25,7 +25,7 @@ def test_axes_turn_with_the_person(turn):
     R = Rotation.from_euler("xyz", turn).as_matrix()
     points = (PERSON @ R.T + (0.5, 0, 3))[None]
     axes = body_rotations(points, np.full((1, 3, 3), np.nan), left_and_up(COCO))
-    np.testing.assert_allclose(axes[0], R @ FACING, atol=0.05)  # who leans 2 degrees back
+    np.testing.assert_allclose(axes[0], R @ FACING, atol=0.05)  # PERSON leans 2 degrees back
     np.testing.assert_allclose(axes[0].T @ axes[0], np.eye(3), atol=1e-12)
     assert np.linalg.det(axes[0]) == pytest.approx(1)
 
@@ -47,11 +47,11 @@ def test_a_layout_without_hips_uses_its_rule_of_handedness():
     data["handedness"] = [{part: [rename[n] for n in points] for part, points in data["handedness"][0].items()}]
     data |= {"names": names, "edges": [], "left_right": [], "derived": {}, "root": names[:1]}
     axes = body_rotations(PERSON[None], np.full((1, 3, 3), np.nan), left_and_up(Layout.from_dict(data)))[0]
-    # Of the head: it is upright and looks at the camera.
+    # These are the axes of the head, which is upright and looks at the camera.
     np.testing.assert_allclose(axes, FACING, atol=0.1)
 
 
-def test_a_thing_without_chest_has_the_models_own_rotation():
+def test_an_object_without_a_chest_has_the_models_rotation():
     door = replace(COCO, names=tuple(f"d{n}" for n in range(17)), handedness=())
     R = Rotation.random(3, random_state=0).as_matrix()
     np.testing.assert_array_equal(body_rotations(np.zeros((3, 17, 3)), R, left_and_up(door)), R)
@@ -78,7 +78,7 @@ def test_quaternions_are_those_of_scipy():
 
 
 def turning(count: int = 100) -> np.ndarray:
-    """Quaternions of a person who turns round twice."""
+    """Return quaternions of a person who turns round twice."""
     turns = np.linspace(0, 4 * np.pi, count)
     return quaternions(Rotation.from_euler("y", turns[:, None]).as_matrix() @ FACING)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts: the shipped ones are right, mapping goes by name, and what is no layout is refused with advice."""
+"""Layouts: the shipped ones are correct, mapping goes by name, and malformed ones are refused with advice."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ DOOR = {
         }
     ],
 }
-#: Rough places of points of a standing person in REP-103's body frame (x forward, y left, z up), metres.
+#: Rough positions of points of a standing person in REP-103's body frame (x forward, y left, z up), metres.
 STANDING = {
     "nose": (0.12, 0, 1.62),
     "eye": (0.1, 0.03, 1.66),

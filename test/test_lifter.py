@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Lifter and the placement: geometry that must hold whatever the model says, and what it refuses."""
+"""The Lifter and the placement: geometry that must hold for every model, and persons that are rejected."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def rigid_lifter(model):
-    """Its shape is known exactly, so that geometry can be checked exactly."""
+    """Return a lifter whose shape is known exactly, so that geometry can be checked exactly."""
     return Lifter(model.rigid())
 
 
@@ -43,7 +43,7 @@ def pinhole(points):
 
 
 def standing(model, position, turn=0.0):
-    """The mean shape in metres, somewhere in front of the camera: (1,P,3)."""
+    """Return the mean shape in metres, somewhere in front of the camera: (1,P,3)."""
     shape = Rotation.from_euler("y", turn).as_matrix() @ model.mean_shape * model.metres_per_unit
     return (shape.T + position)[None]
 
@@ -102,8 +102,8 @@ def test_too_few_points_are_not_lifted_and_the_others_are(model):
 
 
 @pytest.mark.parametrize("camera", [CAMERA, None])
-def test_what_is_unexplained_is_a_share_of_the_extent(rigid_lifter, model, camera):
-    """The same at any size in the image: nothing of the model's own shape, nearly all of points in another order."""
+def test_unexplained_is_a_share_of_the_extent(rigid_lifter, model, camera):
+    """At any size in the image: near 0 for the model's own shape, near 1 for points in another order."""
     truth = np.concatenate([standing(model, [0, 0, 4]), standing(model, [0, 0, 8])])
     order = np.random.default_rng(0).permutation(17)
     right, wrong = (rigid_lifter.lift(pinhole(some), everything(truth), camera) for some in (truth, truth[:, order]))
@@ -164,7 +164,7 @@ def test_hidden_points_do_not_add_to_a_persons_extent(model):
 @pytest.mark.parametrize("camera", [CAMERA, None])
 @pytest.mark.parametrize("breadth, fixed", [(0.0, False), (0.004, False), (0.006, True)])
 def test_persons_on_one_line_are_refused(model, camera, breadth, fixed):
-    """However it slants; the spread across it is a share of that along it. They had a certificate and no ambiguity."""
+    """The line may slant; breadth is its spread over its length. Such persons had a certificate and no ambiguity."""
     rng = np.random.default_rng(0)
     flat = rng.normal(size=(20, 17, 2))
     flat -= flat.mean(1, keepdims=True)
@@ -193,7 +193,7 @@ def test_persons_are_lifted_up_to_a_stated_distance(rigid_lifter, model, distanc
     assert lifted.reason == (reason,) and np.isfinite(lifted.points).all() == (reason == "")
 
 
-def test_who_is_lifted_is_in_front_of_the_camera(model):
+def test_lifted_persons_are_in_front_of_the_camera(model):
     """Points all over a field of nearly 180 degrees: lifted shapes reach behind the camera, some with their roots."""
     wide = Intrinsics(90.0, 90.0, 640.0, 360.0, 1280, 720)
     xy = np.random.default_rng(0).uniform(-1400, 2700, (500, 17, 2))
@@ -286,12 +286,12 @@ def test_one_wild_detection_does_not_turn_the_virtual_camera_away(model):
 
 @pytest.fixture(scope="module")
 def exact_lifter(model_file):
-    """Its model answers with PERSON, whatever it sees."""
+    """Return a lifter whose model always answers with PERSON."""
     return Lifter(load_model(model_file))
 
 
 @pytest.mark.parametrize("camera", [CAMERA, None])
-def test_what_a_detector_got_wrong_is_not_used(exact_lifter, camera):
+def test_misdetections_are_not_used(exact_lifter, camera):
     """One wrist taken from another person: the rest is lifted as if it had been hidden."""
     truth = persons_at((0, 0, 4), (0.5, 0, 4), (-0.5, 0, 4))
     xy = pinhole(truth)
@@ -319,7 +319,7 @@ def test_points_that_miss_by_more_than_35_percent_of_the_extent_are_misdetection
 
 
 def test_points_that_all_fit_are_all_used(exact_lifter):
-    """However small the misses are beside each other: noise of a hundredth of a pixel makes no misdetections."""
+    """Noise of a hundredth of a pixel makes no misdetections, however its sizes differ."""
     truth = np.repeat(persons_at((0, 0, 4)), 50, axis=0)
     xy = pinhole(truth) + np.random.default_rng(0).standard_t(1, (50, 17, 2)).clip(-20, 20) * 0.01
     assert exact_lifter.lift(xy, everything(truth), CAMERA).used.all()
@@ -336,7 +336,7 @@ def with_misfit(model, misfit):
 
 
 def bent(offset=0.03):
-    """PERSON 4 m away with every point a little out of place, (1,17,3) metres."""
+    """Return PERSON 4 m away with every point a little out of place, (1,17,3) metres."""
     return persons_at((0.3, 0, 4)) + offset * np.random.default_rng(0).standard_normal((1, 17, 3))
 
 
@@ -348,7 +348,7 @@ def test_points_are_where_they_are_seen_if_the_model_is_trusted_less(model):
     by_model, as_seen = (Lifter(with_misfit(model, size)).lift(pinhole(truth), visible, CAMERA) for size in (None, 100))
     np.testing.assert_allclose(pinhole(as_seen.points)[visible], pinhole(truth)[visible], atol=1e-6)
     assert np.abs(pinhole(by_model.points) - pinhole(truth))[visible].max() > 1
-    np.testing.assert_array_equal(as_seen.reprojection, by_model.reprojection)  # the model's own, which tells doubt
+    np.testing.assert_array_equal(as_seen.reprojection, by_model.reprojection)  # the model's own, which measures doubt
     np.testing.assert_allclose(as_seen.points[:, 3], by_model.points[:, 3], atol=1e-9)
 
 
@@ -361,7 +361,7 @@ def test_without_intrinsics_points_are_where_they_are_seen_too(model):
 
 
 def test_a_point_seen_far_from_where_the_model_puts_it_moves_less(model):
-    """Beyond two standard deviations, by the square of the two over the distance."""
+    """Beyond two standard deviations it moves by the square of (two deviations over the distance)."""
     xy, visible = pinhole(bent()), everything(bent())
     exact, lifted = (Lifter(with_misfit(model, size)).lift(xy, visible, CAMERA).points[0] for size in (100.0, None))
     virtual = centred_view(xy, visible, CAMERA).turn[0]
@@ -381,12 +381,12 @@ def test_the_rigid_baseline_is_not_moved(model):
 
 
 def test_the_root_is_the_middle_of_the_hips():
-    """In the shipped model's layout pelvis and neck are points of their own, whatever the detector has."""
+    """In the shipped model's layout, pelvis and neck are points of their own for every detector."""
     lifter, truth = Lifter(load_model()), persons_at((0.3, 0, 4), (-1, 0, 5), (1, 0, 5))
     own, point = lifter.model.layout, lifter.model.layout.names.index
     xy, confidence, visible = load_layout("coco17").map_to(own)(pinhole(truth), np.ones((3, 17)), everything(truth))
     visible[1, [point("left_hip"), point("pelvis")]] = False
-    visible[2, point("left_hip")] = False  # and its pelvis seen, which tells more than that hip
+    visible[2, point("left_hip")] = False  # the pelvis is seen, and counts more than the hidden hip
     for camera in (CAMERA, None):
         lifted = lifter.lift(xy, visible, camera)
         for middle, sides in (("pelvis", ["left_hip", "right_hip"]), ("neck", ["left_shoulder", "right_shoulder"])):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OnP against a naive search over random problems, its symmetries, its certificate, and what degenerate input gets.
+"""OnP against a naive search over random problems; its symmetries, its certificate, and degenerate input.
 
-Two poses are compared by their squared residuals, over the squared size of what was fitted. Those are exact to about
-1e-16, but a climb ends at a slope of 1e-10, which where the optimum is flat (a planar shape face on) leaves 1e-12.
+Two poses are compared by their squared residuals over the squared size of the fitted points. These are exact to about
+1e-16.  But a climb ends at a slope of 1e-10, which leaves 1e-12 if the optimum is flat (a planar shape face on).
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def reproducible(examples):
 
 @st.composite
 def problems(draw, most_points=40):
-    """One problem S (3,P), W (2,P), weights (P,) of any size, noise, thickness, place, and share of hidden points."""
+    """Draw a problem S (3,P), W (2,P), weights (P,) of any size, noise, thickness, place and share of hidden points."""
     points = draw(st.integers(3, most_points))
     noise = draw(st.sampled_from([0.0, 1e-3, 0.05, 0.3, 1.0, 5.0]))
     thickness = draw(st.sampled_from([0.0, 1e-6, 1e-3, 0.05, 0.3, 1.0]))
@@ -57,19 +57,19 @@ def problems(draw, most_points=40):
 
 
 def size_of(S, W, w, scale):
-    """Root mean square of what is fitted: the image, and in the unit-scale problem the shape as well."""
+    """Return the rms size of the fitted points: the image's, and in the unit-scale problem also the shape's."""
     shape = rms(centred(S, w), w) if scale == "unit" else 0.0
     return np.hypot(rms(centred(W, w), w), shape)
 
 
 def solve_one(S, W, w, scale, batch=1):
-    """One problem as the last of a batch of copies: many take the path of arrays, few that of floats."""
+    """Solve one problem as the last of a batch of copies: many are solved on arrays, few on floats."""
     found = onp(*(np.repeat(x[None], batch, axis=0) for x in (S, W, w)), scale)
     return type(found)(*(value[-1] for value in found))
 
 
 def random_problems(count, points, noise, seed, flat=1.0):
-    """Shapes (N,3,P), their noisy views (N,2,P) and the true rotations."""
+    """Return shapes (N,3,P), their noisy views (N,2,P) and the true rotations."""
     rng = np.random.default_rng(seed)
     S = rng.standard_normal((count, 3, points)) * np.array([1.0, 1.0, flat])[:, None]
     R = Rotation.random(count, random_state=seed).as_matrix()
@@ -78,13 +78,13 @@ def random_problems(count, points, noise, seed, flat=1.0):
 
 
 def rms_of_pose(S, W, w, R, scale, translation):
-    """(N,) weighted root mean square distances of poses, from the points themselves."""
+    """Return weighted rms distances (N,) of poses, measured on the points themselves."""
     error = scale[:, None, None] * R[:, :2] @ S + translation[..., None] - W
     return np.sqrt((w * (error**2).sum(1)).sum(1) / w.sum(1))
 
 
 def assert_sound(found):
-    """No NaN, proper rotations, and no claim about what is not determined."""
+    """Assert: no NaN, proper rotations, and no claims where no pose is determined."""
     for value in (*found, found.ambiguity):
         assert np.isfinite(value).all()
     for R in (found.R, found.R_mirror):
@@ -116,7 +116,7 @@ HARD_S = [
     [-0.7399, -0.7341, 0.5742, -0.8900, 0.0269],
 ]
 HARD_W = [[0.5667, 0.3028, -0.5255, 0.7719, -0.0365], [-0.6492, -0.0293, -0.1496, -0.1035, -0.6270]]
-"""Of a million random problems in the unit scale, one whose best optimum a search from only eight starts misses."""
+"""One of a million random problems of unit scale: a search from only eight starts misses its best optimum."""
 
 
 @BATCHES
@@ -129,7 +129,7 @@ def test_the_search_after_a_failed_proof_looks_widely_enough(count):
 @BOTH_SCALES
 @pytest.mark.parametrize("points,noise,flat", [(3, 0.3, 1), (4, 0.5, 0.5), (6, 2.0, 0.2), (17, 1.0, 1.0)])
 def test_turning_the_shape_changes_nothing(scale, points, noise, flat):
-    """The search takes other ways then; two ways to different optima would show one of them wrong, certified or not."""
+    """A turned shape changes the search's path; two paths to different optima would show that one is wrong."""
     S, W, _ = random_problems(1500, points, noise, seed=points, flat=flat)
     found = onp(S, W, scale=scale)
     for seed in range(4):
@@ -169,7 +169,7 @@ def test_exact_views_give_the_exact_pose(scale, count):
 @BOTH_SCALES
 @pytest.mark.parametrize("points", [4, 8, 17, 10_000])
 def test_share_certified(scale, points):
-    """Up to the noise of 30 % that is promised; less than all only where few points fit many poses nearly as well."""
+    """Noise goes up to the promised 30 %. Less than all are certified only if few points fit many poses nearly as well."""
     for noise in (0.0, 0.1, 0.3):
         found = onp(*random_problems(40 if points > 100 else 2000, points, noise, seed=4)[:2], scale=scale)
         assert_sound(found)
@@ -180,7 +180,7 @@ def test_share_certified(scale, points):
     "points,noise,flat", [(3, 0.1, 1.0), (4, 1.0, 0.2), (5, 9.0, 1.0), (9, 0.4, 1e-4), (17, 2.0, 1.0)]
 )
 def test_every_free_scale_optimum_is_certified(points, noise, flat):
-    """There the certificate is necessary as well, so that what is not certified was not found."""
+    """With free scale the certificate is also necessary, so an optimum without it was missed."""
     S, W, _ = random_problems(4000, points, noise, seed=12, flat=flat)
     found = onp(S, W)
     assert found.determined.all() and found.certified.all()
@@ -190,7 +190,7 @@ def test_every_free_scale_optimum_is_certified(points, noise, flat):
 @pytest.mark.parametrize("thickness", [0.1, 0.03, 0.01])
 @pytest.mark.parametrize("noise", [0.0, 0.1, 1.0])
 def test_free_scale_poses_of_needles_are_certified(count, thickness, noise):
-    """Seen almost end on, a needle shows its thickness only: the goal bends over angles as small as its aspect."""
+    """A needle seen almost end on shows only its thickness: the goal bends over angles as small as its aspect."""
     rng = np.random.default_rng(21)
     S = rng.standard_normal((400, 3, 9)) * np.array([1.0, thickness, thickness])[:, None]
     S = Rotation.random(400, random_state=21).as_matrix() @ S
@@ -237,7 +237,7 @@ def test_free_residual_follows_the_image_and_forgets_the_size_of_the_shape(probl
 
 
 def well_posed(count, seed=6):
-    """Problems with one clear best pose, so that poses can be compared."""
+    """Return problems with one clear best pose, so that poses can be compared."""
     return random_problems(count, 12, 0.1, seed)[:2]
 
 
@@ -475,7 +475,7 @@ def test_special_input_that_fixes_a_pose_is_solved(scale, count, case):
 @pytest.mark.parametrize(
     "weights", [0.0, np.nan, -1.0, np.inf, "one negative", "one NaN", "one infinite", "two points"]
 )
-def test_weights_that_are_none_are_flagged(scale, count, weights):
+def test_useless_weights_are_flagged(scale, count, weights):
     S, W = well_posed(count)
     w = np.ones((count, 12))
     if weights == "two points":

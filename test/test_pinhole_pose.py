@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement under the pinhole camera: it finds the optimum, moves along the slope, and never makes a pose worse."""
+"""Refinement under the pinhole camera: it finds the optimum and never makes a pose worse."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 
 
 def problems(count: int = 40, noise: float = 0.0, seed: int = 0):
-    """Shapes about as large as a person in model units, seen from 5 units away, and poses near the true ones."""
+    """Return shapes as large as a person in model units, seen from 5 units away, and poses near the true ones."""
     rng = np.random.default_rng(seed)
     S = rng.standard_normal((count, 3, 12))
     R = Rotation.random(count, random_state=seed).as_matrix()
