@@ -281,11 +281,7 @@ def load_layout(name_or_path: str | os.PathLike[str]) -> Layout:
 
 
 def anonymous_layout(points: int, edges: tuple[Pair, ...] = ()) -> Layout:
-    """Return a layout of P points without meaning: p00, p01, ...
-
-    Args:
-        points: number of points P.
-        edges: pairs of point indices.
+    """Return a layout of so many points without meaning: p00, p01, ...
 
     Raises:
         LayoutError: too few or too many points, or an edge that does not join two of them.

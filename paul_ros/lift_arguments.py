@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arguments of ``Lifter.lift``: checked, and converted to arrays and intrinsics."""
+"""The arguments of ``Lifter.lift``: checked, and converted to arrays, intrinsics and layouts."""
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,20 @@ def as_intrinsics(camera: Any) -> Intrinsics | None:
             f"{low:g} to {high:g} pixels: pass the K of the rectified image, not normalised, without skew"
         )
     return Intrinsics(fx, fy, cx, cy, 0, 0, matrix="K")
+
+
+def as_layout(layout: Any) -> Layout:
+    """Return a layout, given itself, its name, or the path of its YAML file.
+
+    Raises:
+        InputError: the argument is none of these.
+        LayoutError: there is no such layout.
+    """
+    if isinstance(layout, Layout):
+        return layout
+    if not isinstance(layout, (str, os.PathLike)):
+        raise InputError(f"layout is a {type(layout).__name__}: pass a name, the path of a YAML file, or a Layout")
+    return load_layout(layout)
 
 
 def _as_visibility(visible: Any, xy: np.ndarray) -> np.ndarray:

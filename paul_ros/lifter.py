@@ -10,8 +10,8 @@ import numpy as np
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import InputError, ModelError
-from paul_ros.layout import Layout, load_layout, midpoints
-from paul_ros.lift_arguments import as_intrinsics, as_points
+from paul_ros.layout import Layout, midpoints
+from paul_ros.lift_arguments import as_intrinsics, as_layout, as_points
 from paul_ros.lifted import (
     BEHIND_CAMERA,
     DEGENERATE_POINTS,
@@ -76,7 +76,6 @@ class Lifter:
             )
         self.model = model
         self.person_height = person_height
-        self._routes: dict[str, Route] = {}
         between = midpoints(model.layout)
         # (M,) midpoints and (2,M) the two points of each.
         self._midpoints = np.array(list(between), int), np.array(list(between.values()), int).reshape(-1, 2).T
@@ -119,7 +118,7 @@ class Lifter:
                 a million pixels out are always hidden.
             camera: pinhole camera of the (rectified) image, for output in metres: Intrinsics, a 3x3 camera matrix K in
                 pixels, or a sensor_msgs/CameraInfo message.  None for output in model units.
-            layout: layout of the points: a shipped one by name, the path of a YAML file (read once), or a Layout.  None
+            layout: layout of the points: a shipped one by name, the path of a YAML file, or a Layout.  None
                 for the model's own.
 
         Returns:
@@ -133,7 +132,7 @@ class Lifter:
         if layout is None:
             xy, seen = as_points(points, visible, self.model.layout)
             return self.lift_in_model_layout(xy, seen, as_intrinsics(camera))
-        route = self._route_from(layout)
+        route = Route.between(as_layout(layout), self.model.layout)
         xy, seen = as_points(points, visible, route.given)
         xy, seen = route.into.values(xy), route.into.visibility(seen)
         return route.lifted_out(self.lift_in_model_layout(xy, seen, as_intrinsics(camera)))
@@ -155,17 +154,6 @@ class Lifter:
             return self._lift_visible(xy, visible, camera)
         lifted = Lifted.nobody((TOO_FEW_POINTS,) * len(xy), self.model.layout, self._units(camera))
         return lifted.with_rows(rows, self._lift_visible(xy[rows], visible[rows], camera)) if rows.any() else lifted
-
-    def _route_from(self, layout: Layout | str | os.PathLike[str]) -> Route:
-        """Return the mappings from a layout to the model's and back; those of names and paths are kept."""
-        if isinstance(layout, Layout):
-            return Route.between(layout, self.model.layout)
-        if not isinstance(layout, (str, os.PathLike)):
-            raise InputError(f"layout is a {type(layout).__name__}: pass a name, the path of a YAML file, or a Layout")
-        name = os.fspath(layout)
-        if name not in self._routes:
-            self._routes[name] = Route.between(load_layout(name), self.model.layout)
-        return self._routes[name]
 
     def _units(self, camera: Intrinsics | None) -> str:
         return "m" if camera and self.metres_per_unit else "model"

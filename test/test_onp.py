@@ -169,7 +169,7 @@ def test_exact_views_give_the_exact_pose(scale, count):
 @BOTH_SCALES
 @pytest.mark.parametrize("points", [4, 8, 17, 10_000])
 def test_share_certified(scale, points):
-    """Noise goes up to the promised 30 %. Less than all are certified only if few points fit many poses nearly as well."""
+    """Noise goes up to the promised 30 %. Only few points, which fit many poses nearly as well, may lack a proof."""
     for noise in (0.0, 0.1, 0.3):
         found = onp(*random_problems(40 if points > 100 else 2000, points, noise, seed=4)[:2], scale=scale)
         assert_sound(found)
