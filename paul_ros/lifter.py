@@ -94,8 +94,8 @@ class Lifter:
         if height:
             if not (stature and metres):
                 raise ModelError(
-                    f"model '{self.model.name}' does not tell the stature that its metres are of, so person_height "
-                    "cannot change them: leave it at 0"
+                    f"model '{self.model.name}' does not tell the stature that its metres refer to, so person_height "
+                    "cannot scale them: leave it at 0"
                 )
             metres *= height / stature
         self._person_height = height

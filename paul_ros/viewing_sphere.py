@@ -278,8 +278,8 @@ def is_certified(xp: Kind, problem: Problem, view: View, scale: Scale) -> Number
     if scale == "unit":
         of_A, of_T = problem.k * of_T, (1 - problem.k) * of_T / (xp.sqrt(abs_square(view.z)) + TINY)
     n, a, d = view.n, problem.a, problem.d
-    K00, K11, K22 = (of_A * a[i] - of_T * abs_square(d[i]) for i in range(3))
-    K12, K02, K01 = (-of_T * (d[i] * d[j].conjugate()).real for i, j in ((1, 2), (0, 2), (0, 1)))
+    K00, K11, K22 = [of_A * a[i] - of_T * abs_square(d[i]) for i in range(3)]
+    K12, K02, K01 = [-of_T * (d[i] * d[j].conjugate()).real for i, j in ((1, 2), (0, 2), (0, 1))]
     mixed = K12 * n[1] * n[2] + K02 * n[0] * n[2] + K01 * n[0] * n[1]
     squares = (n[0] * n[0], n[1] * n[1], n[2] * n[2])
     multiplier = dot((K00, K11, K22), squares) + 2 * mixed + of_T * dot(problem.c, n) + _SLACK

@@ -76,7 +76,7 @@ def test_a_truncated_file_is_refused(saved, share):
 
 @pytest.mark.parametrize("text", ["[]", "3", "null", "[" * 100_000])
 def test_a_header_that_is_no_object_is_refused(saved, text):
-    """With a checksum that is right: the file is whole, and still no model."""
+    """The checksum is correct: the file is complete, but it is no model."""
     buffer = io.BytesIO()
     np.savez(buffer, header=np.frombuffer(text.encode(), np.uint8), **arrays())
     with zipfile.ZipFile(buffer, "a") as archive:
@@ -146,7 +146,7 @@ def test_models_of_unit_scale_see_the_size_of_a_view_and_give_shapes_of_any(tmp_
     assert np.ptp(sizes[0] / sizes[1]) > 0.1
 
 
-def test_old_models_say_nothing_of_scale_and_are_free(saved):
+def test_models_without_a_scale_key_are_free(saved):
     assert load_model(saved).scale == "free" == load_model().scale
 
 
@@ -170,7 +170,7 @@ def test_models_of_upright_views_round_trip(tmp_path):
     np.testing.assert_allclose(model.encode(turned, visible), model.encode(W, visible), atol=1e-5)
 
 
-def test_old_models_say_nothing_of_upright_and_see_views_as_they_are(tmp_path, saved):
+def test_models_without_an_upright_key_see_views_as_they_are(tmp_path, saved):
     assert "upright" not in load_model(saved).header["architecture"]["encoder"]
     save_model(tmp_path / "new.npz", upright_header(False), arrays())
     W, visible = np.random.default_rng(1).standard_normal((4, 2, 17)), np.ones((4, 17), bool)
@@ -212,7 +212,7 @@ def test_enough_is_counted_within_a_category():
     assert enough_visible(visible, layout).tolist() == [True, False, True, False, False]
 
 
-def test_other_npz_files_are_told_from_damaged_models(tmp_path):
+def test_other_npz_files_are_distinguished_from_damaged_models(tmp_path):
     np.savez(tmp_path / "data.npz", W=np.zeros((2, 2, 17)))
     with pytest.raises(ModelError, match="no model file"):
         load_model(tmp_path / "data.npz")
@@ -239,7 +239,7 @@ def test_unknown_models_are_named_with_the_known_ones():
         load_model("/nowhere/x.npz")
 
 
-def test_weights_lie_as_a_few_persons_are_multiplied_fastest(saved):
+def test_weights_are_stored_in_columns_which_is_fastest_for_few_persons(saved):
     assert all(weight.T.flags.c_contiguous for weight in load_model(saved).weights.values())
 
 
