@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import inspect
+import itertools
 import json
 import re
 import sys
@@ -93,9 +94,8 @@ def layouts() -> str:
     from paul_ros.layout import layout_names, load_layout
 
     found = [load_layout(name) for name in layout_names()]
-    return table(
-        ("layout", "points", "description"), [(f"`{x.name}`", len(x.names), " ".join(x.description.split())) for x in found]
-    )
+    rows = [(f"`{layout.name}`", len(layout.names), " ".join(layout.description.split())) for layout in found]
+    return table(("layout", "points", "description"), rows)
 
 
 def recipes() -> str:
@@ -104,14 +104,11 @@ def recipes() -> str:
     rows = []
     for path in sorted(folder.glob("*.yaml")):
         lines = path.read_text().splitlines()
-        head = [line[2:] for line in lines[: _first(lines, lambda line: not line.startswith("#"))] if "SPDX" not in line]
-        settings = [line for line in lines if line and not line.startswith(("#", " "))]
-        rows.append((f"`{path.stem}`", " ".join(head), ", ".join(f"`{line.split('  #')[0]}`" for line in settings)))
+        head = itertools.takewhile(lambda line: line.startswith("#"), lines)
+        purpose = " ".join(line[2:] for line in head if "SPDX" not in line)
+        sets = [line.split("  #")[0] for line in lines if line and not line.startswith(("#", " "))]
+        rows.append((f"`{path.stem}`", purpose, ", ".join(f"`{line}`" for line in sets)))
     return table(("recipe", "purpose", "settings"), rows)
-
-
-def _first(items: list[str], holds: Callable[[str], bool]) -> int:
-    return next((place for place, item in enumerate(items) if holds(item)), len(items))
 
 
 def settings() -> str:
@@ -143,7 +140,7 @@ def _yaml(value: object) -> str:
     """Return a default as YAML has it."""
     if isinstance(value, tuple):
         return f"[{', '.join(map(_yaml, value))}]"
-    return {True: "true", False: "false", None: "null"}.get(value) if value is None or isinstance(value, bool) else str(value)
+    return json.dumps(value) if value is None or isinstance(value, bool) else str(value)
 
 
 def _code(text: str) -> str:
@@ -170,8 +167,8 @@ def _commands(parser: argparse.ArgumentParser, name: str) -> Iterator[str]:
     if not groups:
         positional = [_placeholder(action) for action in parser._actions if not action.option_strings]
         yield f"```text\n{' '.join([name, *positional, '[options]'])}\n```\n"
-        rows = [_row(action, parser) for action in parser._actions if action.help != argparse.SUPPRESS and action.dest != "help"]
-        yield table(("argument", "meaning"), rows)
+        shown = [action for action in parser._actions if action.help != argparse.SUPPRESS and action.dest != "help"]
+        yield table(("argument", "meaning"), [_row(action, parser) for action in shown])
         if parser.epilog:
             yield f"```text\n{parser.epilog.strip()}\n```\n"
     for group in groups:
@@ -183,7 +180,8 @@ def _row(action: argparse.Action, parser: argparse.ArgumentParser) -> tuple[str,
     words = action.option_strings or [_placeholder(action)]
     value = "" if action.nargs == 0 or not action.option_strings else f" {_placeholder(action)}"
     text = (action.help or "") % {"default": action.default, "prog": parser.prog}
-    return f"`{', '.join(words)}{value}`" + (" (required)" if action.option_strings and action.required else ""), _escaped(text)
+    required = " (required)" if action.option_strings and action.required else ""
+    return f"`{', '.join(words)}{value}`{required}", _escaped(text)
 
 
 def _placeholder(action: argparse.Action) -> str:

@@ -31,7 +31,9 @@ def broken_links(document: Path) -> list[str]:
     """Links without a scheme, [..](path#heading) and src or href="path", to no file or to no heading of its page."""
     targets = [a or b for a, b in _LINK.findall(document.read_text())]
     return [
-        target for target in targets if not re.match(r"[a-z][a-z+.-]*:", target) and not _leads(document, *_split(target))
+        target
+        for target in targets
+        if not re.match(r"[a-z][a-z+.-]*:", target) and not _leads(document, *_split(target))
     ]
 
 

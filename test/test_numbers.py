@@ -46,7 +46,10 @@ def test_every_group_says_where_its_figures_come_from() -> None:
 
 def test_a_figure_keeps_its_decimals_commas_and_stars(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(generate, "numbers", lambda: {"a.b": 1234.5678, "c": 0.5})
-    assert generate.filled("1<!--a.b-->, 1,1.0<!--a.b-->, **9.99**<!--c-->") == "1235<!--a.b-->, 1,234.6<!--a.b-->, **0.50**<!--c-->"
+    assert (
+        generate.filled("1<!--a.b-->, 1,1.0<!--a.b-->, **9.99**<!--c-->")
+        == "1235<!--a.b-->, 1,234.6<!--a.b-->, **0.50**<!--c-->"
+    )
 
 
 def test_an_unknown_figure_is_refused() -> None:

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""README and pages: Sphinx builds them without a warning, their code runs, their commands are those of the package.
+
+Python blocks run, in order and in one namespace a page, in a folder that has the shipped recordings. So do shell blocks
+below a line ``<!-- run -->``; ``<!-- run with ... -->`` adds words to their last command, as fewer steps. A block below
+a line with nothing but a file's name in backquotes is that file. All other shell lines are parsed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+from test_numbers import script
+
+from paul_ros.layout import Layout
+from paul_ros.stream.parameters import DEFAULTS
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "benchmarks/RESULTS.md", *sorted((ROOT / "docs").rglob("*.md"))]
+NAMES = {page: str(page.relative_to(ROOT)) for page in PAGES}
+_BLOCK = re.compile(
+    r"^(?:<!-- run(?P<with>.*?) -->\n|`(?P<file>[^`\n]+)`\n\n)?```(?P<kind>\w+)\n(?P<text>.*?)^```\n", re.M | re.S
+)
+_INLINE = re.compile(r"`(paul \w[^`]*)`")
+#: Topics that may be remapped, and what a node's own name is remapped by.
+TOPICS = {"keypoints", "camera_info", "depth", "__node", "__ns"}
+#: Words in place of something that a user has.
+_PLACEHOLDER = re.compile(r"COMMAND|\.\.\.")
+
+pytestmark = pytest.mark.docs
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of code: its language, its text, the file that it is, and whether and with which more words it runs."""
+
+    kind: str
+    text: str
+    file: str | None
+    runs: bool
+    more: tuple[str, ...]
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    for match in _BLOCK.finditer(page.read_text()):
+        words = shlex.split((match["with"] or "").removeprefix(" with"))
+        yield Block(match["kind"], match["text"], match["file"], match["with"] is not None, tuple(words))
+
+
+def lines(page: Path, *kinds: str) -> list[str]:
+    """Commands of a page's shell blocks; a backslash continues a line."""
+    text = "".join(block.text for block in blocks(page) if block.kind in kinds)
+    return [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+def commands(program: str) -> list:
+    """(page, words) of every line of any page that starts this program, as cases."""
+    cases = []
+    for page in PAGES:
+        found = lines(page, "sh") + (_INLINE.findall(page.read_text()) if program == "paul" else [])
+        for line in found:
+            words = shlex.split(line, comments=True)
+            if program in words and not _PLACEHOLDER.search(line):
+                cases.append(pytest.param(words[words.index(program) + 1 :], id=f"{NAMES[page]}: {line[:60]}"))
+    return cases
+
+
+def parse(words: list[str]) -> None:
+    """Raise where `paul` would refuse these words."""
+    script("generate").paul_parser().parse_args(words)
+
+
+@pytest.mark.parametrize("words", commands("paul"))
+def test_every_paul_command_parses(words: list[str]) -> None:
+    if len(words) > 1 or words[0] == "demo":  # a name alone is prose
+        parse(words)
+
+
+def test_a_command_that_does_not_exist_is_found() -> None:
+    with pytest.raises(SystemExit):
+        parse(["replay", "x.mcap", "--no-such-option"])
+
+
+def refused_ros(words: list[str]) -> list[str]:
+    """What is wrong with the words after `ros2` of a `run` or `launch` of this package."""
+    if words[:2] == ["run", "paul_ros"]:
+        return _refused_run(words[2:])
+    if words[:2] == ["launch", "paul_ros"]:
+        return _refused_launch(*words[2:])
+    return []
+
+
+def _refused_run(words: list[str]) -> list[str]:
+    wrong = [] if (ROOT / "lib/paul_ros" / words[0]).exists() else [words[0]]
+    for flag, value in zip(words, words[1:]):
+        name = value.partition(":=")[0]
+        known = {"-p": {*DEFAULTS, "use_sim_time"}, "-r": TOPICS}.get(flag)
+        if known and name not in known and not (flag == "-p" and name.startswith("qos_overrides./")):
+            wrong.append(value)
+    return wrong
+
+
+def _refused_launch(name: str, *arguments: str) -> list[str]:
+    file = ROOT / "launch" / name
+    if not file.exists():
+        return [name]
+    known = {argument.get("name") for argument in ElementTree.parse(file).getroot().findall("arg")}
+    return [argument for argument in arguments if argument.partition(":=")[0] not in known]
+
+
+@pytest.mark.parametrize("words", commands("ros2"))
+def test_every_ros_command_names_what_exists(words: list[str]) -> None:
+    assert refused_ros(words) == []
+
+
+def test_a_ros_command_with_a_wrong_name_is_found() -> None:
+    words = ["run", "paul_ros", "lifter", "--ros-args", "-p", "smothing:=1.0", "-r", "keypoint:=/x"]
+    assert refused_ros(words) == ["smothing:=1.0", "keypoint:=/x"]
+    assert refused_ros(["launch", "paul_ros", "lifter.launch.xml", "topic:=/x"]) == ["topic:=/x"]
+
+
+def having(holds: Callable[[Block], bool]) -> list:
+    """Pages with such a block, as cases."""
+    return [pytest.param(page, id=NAMES[page]) for page in PAGES if any(map(holds, blocks(page)))]
+
+
+@pytest.mark.parametrize("page", having(lambda block: block.runs or block.kind == "python"))
+def test_the_code_of_a_page_runs(page: Path, tmp_path: Path) -> None:
+    for name in ("bags", "paul_ros", "training"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    for block in blocks(page):
+        if block.file:
+            (tmp_path / block.file).parent.mkdir(exist_ok=True)
+            (tmp_path / block.file).write_text(block.text)
+        elif block.kind == "sh" and block.runs:
+            run_shell(block, tmp_path)
+    code = "\n".join(block.text for block in blocks(page) if block.kind == "python")
+    run([sys.executable, "-c", code], tmp_path)
+
+
+def run_shell(block: Block, folder: Path) -> None:
+    found = [shlex.split(line, comments=True) for line in block.text.replace("\\\n", " ").splitlines()]
+    for words in filter(None, found):
+        assert words[0] == "paul", "only `paul` runs in a test"
+        more = block.more if words is found[-1] else ()
+        run([sys.executable, "-m", "paul_ros.cli", *words[1:], *more], folder)
+
+
+def run(command: list[str], folder: Path) -> None:
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=300, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", having(lambda block: block.kind == "yaml"))
+def test_layouts_in_yaml_are_layouts(page: Path) -> None:
+    for block in blocks(page):
+        if block.kind == "yaml":
+            data = yaml.safe_load(block.text)
+            if "names" in data:
+                assert Layout.from_dict(data).names
+
+
+def test_sphinx_builds_all_pages_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("myst_parser")
+    pytest.importorskip("furo")
+    options = ["-W", "--keep-going", "-q", "-b", "html", "-d", str(tmp_path / "doctrees")]
+    run([sys.executable, "-m", "sphinx", *options, str(ROOT / "docs"), str(tmp_path / "html")], ROOT)
+    assert (tmp_path / "html/tutorials/your_own_object.html").exists()
