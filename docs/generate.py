@@ -186,7 +186,7 @@ def _row(action: argparse.Action, parser: argparse.ArgumentParser) -> tuple[str,
 
 def _placeholder(action: argparse.Action) -> str:
     choices = f"{{{','.join(map(str, action.choices))}}}" if action.choices else action.dest.upper()
-    word = str(action.metavar or choices)
+    word = " ".join(action.metavar) if isinstance(action.metavar, tuple) else str(action.metavar or choices)
     return {"+": f"{word} ...", "*": f"[{word} ...]", "?": f"[{word}]"}.get(str(action.nargs), word)
 
 

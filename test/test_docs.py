@@ -8,6 +8,9 @@ a line with nothing but a file's name in backquotes is that file. All other shel
 
 from __future__ import annotations
 
+import argparse
+import itertools
+import json
 import os
 import re
 import shlex
@@ -24,6 +27,7 @@ from test_numbers import script
 
 from paul_ros.layout import Layout
 from paul_ros.stream.parameters import DEFAULTS
+from paul_ros.stream.stream import open_stream
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "benchmarks/RESULTS.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -32,6 +36,7 @@ _BLOCK = re.compile(
     r"^(?:<!-- run(?P<with>.*?) -->\n|`(?P<file>[^`\n]+)`\n\n)?```(?P<kind>\w+)\n(?P<text>.*?)^```\n", re.M | re.S
 )
 _INLINE = re.compile(r"`(paul \w[^`]*)`")
+_BESIDE = re.compile(r"(?<=\S) {2,}.*")  # what a line of `--help` says of the example before it
 #: Topics that may be remapped, and what a node's own name is remapped by.
 TOPICS = {"keypoints", "camera_info", "depth", "__node", "__ns"}
 #: Words in place of something that a user has.
@@ -63,32 +68,61 @@ def lines(page: Path, *kinds: str) -> list[str]:
     return [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
 
 
-def commands(program: str) -> list:
-    """(page, words) of every line of any page that starts this program, as cases."""
+def commands(program: str, find: Callable[[Path], list[str]]) -> list:
+    """Words after the program's name of every line with it that `find` gives of a page, as cases."""
     cases = []
     for page in PAGES:
-        found = lines(page, "sh") + (_INLINE.findall(page.read_text()) if program == "paul" else [])
-        for line in found:
-            words = shlex.split(line, comments=True)
+        for line in find(page):
+            words = list(itertools.takewhile(lambda word: word != "|", shlex.split(line, comments=True)))
             if program in words and not _PLACEHOLDER.search(line):
-                cases.append(pytest.param(words[words.index(program) + 1 :], id=f"{NAMES[page]}: {line[:60]}"))
+                cases.append(pytest.param(words[words.index(program) + 1 :], id=f"{NAMES[page]}: {line.strip()[:60]}"))
     return cases
 
 
-def parse(words: list[str]) -> None:
-    """Raise where `paul` would refuse these words."""
-    script("generate").paul_parser().parse_args(words)
+def shell_lines(page: Path) -> list[str]:
+    return lines(page, "sh")
 
 
-@pytest.mark.parametrize("words", commands("paul"))
-def test_every_paul_command_parses(words: list[str]) -> None:
-    if len(words) > 1 or words[0] == "demo":  # a name alone is prose
-        parse(words)
+def help_lines(page: Path) -> list[str]:
+    """Examples of `--help`, without what stands beside them."""
+    return [_BESIDE.sub("", line) for line in lines(page, "text") if line.startswith("  paul ")]
 
 
-def test_a_command_that_does_not_exist_is_found() -> None:
+def inline(page: Path) -> list[str]:
+    return _INLINE.findall(page.read_text())
+
+
+@pytest.fixture(scope="module")
+def paul() -> argparse.ArgumentParser:
+    return script("generate").paul_parser()
+
+
+@pytest.mark.parametrize("words", commands("paul", shell_lines) + commands("paul", help_lines))
+def test_every_command_parses(paul: argparse.ArgumentParser, words: list[str]) -> None:
+    paul.parse_args(words)
+
+
+def unknown(parser: argparse.ArgumentParser, words: list[str]) -> list[str]:
+    """Commands and options among the words that `paul` does not have; a command in a sentence may lack the rest."""
+    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if groups and words:
+        child = groups[0].choices.get(words[0])
+        return unknown(child, words[1:]) if child else words[:1]
+    return [
+        word for word in words if word.startswith("-") and word != "-" and word not in parser._option_string_actions
+    ]
+
+
+@pytest.mark.parametrize("words", commands("paul", inline))
+def test_commands_in_sentences_exist(paul: argparse.ArgumentParser, words: list[str]) -> None:
+    assert unknown(paul, words) == []
+
+
+def test_a_command_that_does_not_exist_is_found(paul: argparse.ArgumentParser) -> None:
     with pytest.raises(SystemExit):
-        parse(["replay", "x.mcap", "--no-such-option"])
+        paul.parse_args(["replay", "x.mcap", "--no-such-option"])
+    assert unknown(paul, ["replay", "--no-such-option"]) == ["--no-such-option"]
+    assert unknown(paul, ["repaly", "x.mcap"]) == ["repaly"]
 
 
 def refused_ros(words: list[str]) -> list[str]:
@@ -118,7 +152,7 @@ def _refused_launch(name: str, *arguments: str) -> list[str]:
     return [argument for argument in arguments if argument.partition(":=")[0] not in known]
 
 
-@pytest.mark.parametrize("words", commands("ros2"))
+@pytest.mark.parametrize("words", commands("ros2", shell_lines))
 def test_every_ros_command_names_what_exists(words: list[str]) -> None:
     assert refused_ros(words) == []
 
@@ -135,17 +169,19 @@ def having(holds: Callable[[Block], bool]) -> list:
 
 
 @pytest.mark.parametrize("page", having(lambda block: block.runs or block.kind == "python"))
-def test_the_code_of_a_page_runs(page: Path, tmp_path: Path) -> None:
+def test_the_code_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     for name in ("bags", "paul_ros", "training"):
-        (tmp_path / name).symlink_to(ROOT / name)
+        Path(name).symlink_to(ROOT / name)
+    names: dict = {}
     for block in blocks(page):
         if block.file:
-            (tmp_path / block.file).parent.mkdir(exist_ok=True)
-            (tmp_path / block.file).write_text(block.text)
+            Path(block.file).parent.mkdir(exist_ok=True)
+            Path(block.file).write_text(block.text)
+        elif block.kind == "python":
+            exec(compile(block.text, NAMES[page], "exec"), names)
         elif block.kind == "sh" and block.runs:
             run_shell(block, tmp_path)
-    code = "\n".join(block.text for block in blocks(page) if block.kind == "python")
-    run([sys.executable, "-c", code], tmp_path)
 
 
 def run_shell(block: Block, folder: Path) -> None:
@@ -161,6 +197,27 @@ def run(command: list[str], folder: Path) -> None:
         command, cwd=folder, capture_output=True, text=True, timeout=300, env=os.environ | {"PYTHONPATH": str(ROOT)}
     )
     assert done.returncode == 0, done.stderr
+
+
+def first_column(page: str, heading: str) -> set[str]:
+    """Names in backquotes in the first column of the tables below a heading."""
+    section = (ROOT / page).read_text().split(f"{heading}\n", 1)[1].split("\n#", 1)[0]
+    cells = re.findall(r"^\| (`[^|]*) \|", section, re.M)
+    return {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
+
+
+def test_the_keys_of_a_replay_are_those_documented(tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    run(
+        [sys.executable, "-m", "paul_ros.cli", "replay", str(ROOT / "bags/one_person.mcap"), "--json", str(report)],
+        ROOT,
+    )
+    assert json.loads(report.read_text()).keys() == first_column("docs/reference/json.md", "## `paul replay`")
+
+
+def test_the_keys_of_the_layout_topic_are_those_documented() -> None:
+    described = open_stream().describe()
+    assert described.keys() == first_column("docs/reference/node.md", "### The JSON of `~/layout`")
 
 
 @pytest.mark.parametrize("page", having(lambda block: block.kind == "yaml"))
