@@ -42,7 +42,6 @@ demo: setup
 	$(VENV)/bin/paul demo
 
 docs: setup
-	$(VENV)/bin/python docs/generate.py
 	$(VENV)/bin/python -m sphinx -W --keep-going -q -b html docs out/docs
 
 clean:

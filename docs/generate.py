@@ -29,6 +29,7 @@ PAGES = (ROOT / "README.md", ROOT / "benchmarks/RESULTS.md", *sorted((ROOT / "do
 _FIGURE = re.compile(r"(-?\d[\d,]*)(\.\d+)?(\*\*)?<!--([\w.]+)-->")
 _REGION = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n        .*)*)", re.MULTILINE)
+_COMMENT = re.compile(r"^    (\w+): .*?  # (.*)$", re.MULTILINE)
 _SECTION = re.compile(r"\nAttributes:\n(.*?)(?:\n\n|\Z)", re.DOTALL)
 
 
@@ -120,17 +121,17 @@ def settings() -> str:
 
 def views() -> str:
     """Return the table of the settings of motion-capture views."""
-    from training.people.view_settings import Views
+    from training.people.view_settings import ViewSettings
 
-    return attributes(Views)
+    return attributes(ViewSettings)
 
 
 def attributes(kind: type) -> str:
-    """Return a table of a dataclass: names, defaults, and what its docstring says of them below ``Attributes:``."""
+    """Return a table of a dataclass: names, defaults, and what its docstring or a comment beside it says of each."""
     section = _SECTION.search(inspect.getdoc(kind) or "")
-    meanings = {name: " ".join(text.split()) for name, text in _ATTRIBUTE.findall(section[1] if section else "")}
+    meanings = dict(_COMMENT.findall(inspect.getsource(kind))) | dict(_ATTRIBUTE.findall(section[1] if section else ""))
     rows = [
-        (f"`{field.name}`", f"`{_yaml(field.default)}`", _code(meanings[field.name]))
+        (f"`{field.name}`", f"`{_yaml(field.default)}`", _code(meanings.get(field.name, "")))
         for field in dataclasses.fields(kind)
     ]
     return table(("setting", "default", "meaning"), rows)
@@ -144,8 +145,8 @@ def _yaml(value: object) -> str:
 
 
 def _code(text: str) -> str:
-    """Return a docstring's text as Markdown: two backquotes become one."""
-    return text.replace("``", "`")
+    """Return a docstring's text as a cell of Markdown: one line, and one backquote in place of two."""
+    return " ".join(text.split()).replace("``", "`")
 
 
 def commands() -> str:

@@ -92,6 +92,10 @@ def inline(page: Path) -> list[str]:
     return _INLINE.findall(page.read_text())
 
 
+def inline_scripts(page: Path) -> list[str]:
+    return re.findall(r"`(python [^`]*)`", page.read_text())
+
+
 @pytest.fixture(scope="module")
 def paul() -> argparse.ArgumentParser:
     return script("generate").paul_parser()
@@ -150,6 +154,19 @@ def _refused_launch(name: str, *arguments: str) -> list[str]:
         return [name]
     known = {argument.get("name") for argument in ElementTree.parse(file).getroot().findall("arg")}
     return [argument for argument in arguments if argument.partition(":=")[0] not in known]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES.get)
+def test_make_has_the_targets_that_pages_name(page: Path) -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.M))
+    named = {line.split()[1] for line in lines(page, "sh") if line.startswith("make ")}
+    assert named | set(re.findall(r"`make ([\w-]+)`", page.read_text())) <= targets
+
+
+@pytest.mark.parametrize("words", commands("python", shell_lines) + commands("python", inline_scripts))
+def test_scripts_and_modules_exist(words: list[str]) -> None:
+    module = ROOT / words[1].replace(".", "/") if words[0] == "-m" else ROOT / words[0]
+    assert module.is_file() or module.with_suffix(".py").is_file() or (module / "__main__.py").is_file()
 
 
 @pytest.mark.parametrize("words", commands("ros2", shell_lines))
