@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of Sphinx for these pages: `make docs`, or rosdoc2."""
+"""Settings of Sphinx for these pages: `make docs`, or rosdoc2 in a sourced workspace."""
 
 import sys
 from pathlib import Path
@@ -14,9 +14,8 @@ copyright = "The paul_ros authors, Apache-2.0"
 version = release = paul_ros.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
-myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
-suppress_warnings = ["myst.header"]  # generated tables begin below a heading of their page
 
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
@@ -24,4 +23,6 @@ napoleon_use_ivar = True
 
 html_theme = "furo"
 html_title = "paul_ros"
-exclude_patterns = ["_build"]
+# rosdoc2 adds its own index, a page for each module and the README: these pages stand in their place, in their theme.
+exclude_patterns = ["*.rst", "standard_docs"]
+rosdoc2_settings = {"override_theme": False}

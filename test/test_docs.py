@@ -25,6 +25,7 @@ import pytest
 import yaml
 from test_numbers import script
 
+from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout
 from paul_ros.stream.parameters import DEFAULTS
 from paul_ros.stream.stream import open_stream
@@ -230,6 +231,13 @@ def test_the_keys_of_a_replay_are_those_documented(tmp_path: Path) -> None:
         ROOT,
     )
     assert json.loads(report.read_text()).keys() == first_column("docs/reference/json.md", "## `paul replay`")
+
+
+def test_the_keys_of_a_layout_file_are_those_documented() -> None:
+    with pytest.raises(LayoutError, match="unknown key 'colour'") as refused:
+        Layout.from_dict({"colour": "red"})
+    known = str(refused.value).split("keys are ")[1]
+    assert set(known.split(", ")) == first_column("docs/reference/layouts.md", "## Keys")
 
 
 def test_the_keys_of_the_layout_topic_are_those_documented() -> None:
