@@ -52,6 +52,17 @@ def test_every_relative_link_leads_to_a_file_and_heading(document: Path) -> None
     assert not broken_links(document)
 
 
+def named_pages(file: Path) -> set[str]:
+    """Pages of docs/ that a source file names by their path."""
+    return set(re.findall(r"\bdocs/[\w/]+\.\w+", file.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("folder", ("paul_ros", "msg_adapters", "training", "benchmarks", "bags", "docs", "launch"))
+def test_sources_name_pages_that_exist(folder: str) -> None:
+    files = [path for path in (ROOT / folder).rglob("*.*") if path.suffix in (".py", ".yaml", ".xml", ".md")]
+    assert {name: file for file in files for name in named_pages(file) if not (ROOT / name).exists()} == {}
+
+
 def test_every_page_is_in_the_index() -> None:
     index = (ROOT / "docs/index.md").read_text()
     pages = [path.relative_to(ROOT / "docs").with_suffix("") for path in (ROOT / "docs").rglob("*.md")]
