@@ -62,7 +62,7 @@ def group(command: str, values: dict[str, float]) -> dict:
 
 def recordings() -> dict[str, float]:
     """Replay the shipped recordings; shares become per cent."""
-    found = {}
+    found: dict[str, float] = {}
     for name, bag in BAGS.items():
         report = _json_of("replay", str(ROOT / "bags" / bag))
         found |= {f"{name}.{key}": report[key] for key in KEYS}
@@ -97,7 +97,7 @@ def _json_of(*words: str) -> dict:
 
 def human(rows: list[dict]) -> dict[str, float]:
     """Take the first and the noisy row of COCO-17 from `benchmarks/human_model.py`."""
-    found = {}
+    found: dict[str, float] = {}
     for name, what in {"coco17_true": "coco17, true 2D", "coco17_noise": "coco17, noise profile"}.items():
         by_model = {row["model"]: row for row in rows if row["what"] == what}
         ours, rigid = by_model.pop("human"), by_model.pop(RIGID)
@@ -121,7 +121,7 @@ def nrsfm(rows: list[dict]) -> dict[str, float]:
 
 def node(rows: list[dict]) -> dict[str, float]:
     """Take latency and memory of each number of persons and rate."""
-    found = {}
+    found: dict[str, float] = {}
     for row in rows:
         cell = f"node.{row['persons']}_{row['rate_hz']}"
         echo = "echo_" if row["node"] == "echo" else ""

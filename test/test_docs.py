@@ -131,7 +131,7 @@ def test_a_command_that_does_not_exist_is_found(paul: argparse.ArgumentParser) -
 
 
 def refused_ros(words: list[str]) -> list[str]:
-    """What is wrong with the words after `ros2` of a `run` or `launch` of this package."""
+    """Names after `ros2 run` or `ros2 launch` that this package does not have."""
     if words[:2] == ["run", "paul_ros"]:
         return _refused_run(words[2:])
     if words[:2] == ["launch", "paul_ros"]:
