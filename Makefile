@@ -7,7 +7,7 @@ PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --c
 SOURCES := setup.py setup.cfg pyproject.toml package.xml \
 	$(shell find paul_ros msg_adapters training lib launch config rviz foxglove sros2 resource bags -type f -not -path '*/__pycache__/*')
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test lint docs clean
 
 setup: $(VENV)/.package
 
@@ -40,6 +40,9 @@ lint: setup
 
 demo: setup
 	$(VENV)/bin/paul demo
+
+docs: setup
+	$(VENV)/bin/python -m sphinx -W --keep-going -q -b html docs out/docs
 
 clean:
 	rm -rf $(VENV) build install log out *.egg-info

@@ -350,8 +350,8 @@ def test_a_layout_of_another_thing_is_refused(make, type_name, names):
     assert reason_of(make, type_name, every_message(make)[type_name], names) == "no_common_names"
 
 
-def test_the_readme_tells_every_type_that_can_be_read():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_documentation_lists_every_type_that_can_be_read():
+    text = (ROOT / "docs/reference/messages.md").read_text(encoding="utf-8")
     assert [name for name in SUPPORTED if f"`{name.replace('/msg/', '/')}`" not in text] == []
 
 

@@ -624,6 +624,4 @@ def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
 def test_parameter_file_and_table_come_from_one_place():
     shipped = (ROOT / "config" / "lifter.yaml").read_text()
     assert shipped == parameters.as_yaml(), "python -m paul_ros.stream.parameters > config/lifter.yaml"
-    assert parameters.as_markdown() in (ROOT / "README.md").read_text(), (
-        "paste paul_ros.stream.parameters.as_markdown()"
-    )
+    assert parameters.as_markdown() in (ROOT / "docs/reference/node.md").read_text(), "python docs/generate.py"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What docs/onp.md says: its example runs, its tables are those that its script prints, its formulas hold."""
+"""What docs/explanation/onp.md says: its example runs, its tables are those that its script prints, its formulas hold."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from test_links import broken_links
 from paul_ros.orthographic_n_point import onp
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGE = DOCS / "onp.md"
+PAGE = DOCS / "explanation/onp.md"
 TABLES = ("certificate", "failures", "uncertified", "optima", "approximation")
 
 

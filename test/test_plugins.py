@@ -25,7 +25,7 @@ from paul_ros.stream.stream import LiftStream
 
 PEOPLE = "acme_msgs/msg/People"
 TRUE = persons_at((0.3, 0, 4), (-1, 0.1, 5))
-TEXT = (ROOT / "docs/adapters.md").read_text()
+TEXT = (ROOT / "docs/how_to/write_an_adapter.md").read_text()
 
 
 def block(name: str) -> str:
