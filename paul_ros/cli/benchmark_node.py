@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from paul_ros.cli.options import RAW, Commands, add_json, add_plot, minutes, positive, positives
+from paul_ros.cli.options import Commands, HelpFormatter, add_json, add_plot, minutes, positive, positives
 from paul_ros.cli.output import check_files, publish
 
 _EPILOG = """\
@@ -16,12 +16,13 @@ take turns of about two seconds.
 
 columns, a line for each number of persons, rate and node; times in µs:
   received  messages that a PoseArray answered, of those sent
-  median    from the publisher's stamp to the arrival of the answer at the listener, which takes serialised
-            messages; then the 99th percentile
+  median    from the publisher's stamp to the arrival of the answer at the listener, which takes
+            serialised messages; then the 99th percentile
   CPU       time that all threads of the node's process used, per frame
   MB        resident memory after the last frame
   x echo    the median over the echo node's; then the same for the 99th percentiles
   + CPU     CPU time minus that of the echo node
+
 Start to first output counts from the start of the process, with a detector already running: median of three.
 
 Other work on the machine spoils the figures: compare the load in the report.
@@ -40,7 +41,7 @@ def add_parser(subjects: Commands) -> None:
         help="the ROS 2 node: latency, CPU time and memory, beside a node that does not lift",
         description="Measure latency, CPU time and memory of the ROS 2 node, and of a baseline that does not lift.",
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument(
         "--persons", metavar="A,B", type=positives, default=[1, 10, 50], help="persons in an image (default: 1,10,50)"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from paul_ros.cli.options import RAW, Commands, add_json, add_plot, add_runs, names, share
+from paul_ros.cli.options import Commands, HelpFormatter, add_json, add_plot, add_runs, names, share
 from paul_ros.cli.output import check_files, publish
 
 _METHODS = "paul,adl,adl_low_rank,linear,rigid"
@@ -20,7 +20,7 @@ methods:
   adl_low_rank  its decoder alone, with a nuclear norm
   linear        the linear model that the search starts from
   rigid         one shape for all frames
-or the name or YAML file of a recipe of your own.
+  RECIPE        name or YAML file of a recipe of your own
 
 The work folder keeps every finished run. The same command continues an interrupted benchmark, and trains
 only runs that are missing. Other settings, data or versions of this package are other runs. Use --fresh
@@ -40,7 +40,7 @@ def add_parser(subjects: Commands) -> None:
         help="non-rigid structure from motion: the paper's table beside ours",
         description="Reconstruct sequences by several methods and seeds. Print errors beside the published ones.",
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("--data", metavar="FOLDER", type=Path, required=True, help="folder of npz files")
     parser.add_argument("--sequences", metavar="A,B", type=names, help="file names without suffix (default: all)")

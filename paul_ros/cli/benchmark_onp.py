@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from paul_ros.cli.options import RAW, Commands, add_json, add_plot, natural, positive
+from paul_ros.cli.options import Commands, HelpFormatter, add_json, add_plot, natural, positive
 from paul_ros.cli.output import check_files, publish
 
 _DESCRIPTION = """\
@@ -25,6 +25,7 @@ columns, a line for each scenario and method:
             polar and majorise solve only batches, so this is mostly the price of NumPy's calls
   µs batch  time of a pose in one call with --batch of them
   x lsq     µs batch over that of lsq_svd
+
 "More" and "less" mean by 1e-9 of the image's mean square, in means of squared distances. Noise is the
 standard deviation of each image coordinate over the shape's rms radius / sqrt(3), both in the image's unit.
 
@@ -48,7 +49,7 @@ def add_parser(subjects: Commands) -> None:
         help="orthographic-N-point: optimality, residuals and times of five solvers",
         description=_DESCRIPTION,
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument(
         "--cases", metavar="N", type=positive, default=4400, help="problems in a scenario (default: %(default)s)"

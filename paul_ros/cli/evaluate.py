@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from paul_ros.cli.options import RAW, Commands, add_json, add_plot
+from paul_ros.cli.options import Commands, HelpFormatter, add_json, add_plot
 from paul_ros.cli.output import check_files, publish
 from paul_ros.cli.progress import progress
 
@@ -39,7 +39,7 @@ def add_parser(commands: Commands) -> None:
         help="judge a model on unseen frames, or a reconstruction, against the 3D truth",
         description=_DESCRIPTION,
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("model", metavar="MODEL", help="model file or shipped model; with --truth saved shapes (.npz)")
     parser.add_argument("data", metavar="DATA", type=Path, nargs="?", help="npz with W and the truth S, see below")

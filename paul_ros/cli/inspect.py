@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import argparse
 
-from paul_ros.cli.options import RAW, Commands, add_json
+from paul_ros.cli.options import Commands, HelpFormatter, add_json
 from paul_ros.cli.output import check_files, publish
 
 _EPILOG = """\
@@ -23,7 +23,7 @@ def add_parser(commands: Commands) -> None:
         help="summarise a model, a bag or a layout",
         description="Summarise a model, a bag or a keypoint layout.",
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument(
         "thing",

@@ -11,7 +11,7 @@ import signal
 import sys
 
 from paul_ros import __version__
-from paul_ros.cli.options import Commands
+from paul_ros.cli.options import Commands, HelpFormatter
 
 COMMANDS = ("lift", "replay", "view", "inspect", "train", "evaluate", "study", "demo", "benchmark")
 """Modules of this package, in the order of `paul --help`; each has `add_parser(commands)`."""
@@ -71,7 +71,7 @@ def _parser(argv: list[str]) -> argparse.ArgumentParser:
         prog="paul",
         description="Lift the 2D keypoints of any object to 3D, with a model that is learned from 2D alone.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"paul_ros {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from paul_ros.cli.options import RAW, Commands, add_model, add_output_layout, add_person_height
+from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_layout, add_person_height
 from paul_ros.cli.output import STDOUT, check_files, open_output
 from paul_ros.cli.progress import progress
 
@@ -27,24 +27,27 @@ _UNLIKE = "unlike_the_model"
 _UNLIKE_SHARE = 0.5  # of a person is not explained; the stream notes such persons too
 _DESCRIPTION = """\
 Lift arrays of 2D keypoints to 3D, each person alone, as the ROS 2 node does. No ROS is needed.
-With a camera the points are in metres from the camera; without one in model units from each person's root.
+The points are in metres from the camera if a camera is given, otherwise in model units from each person's root.
 """
 _EPILOG = """\
 input, N persons of P keypoints in pixels (x right, y down), NaN where hidden:
   .npz   keypoints (N,P,2), or (N,P,3) with the confidences, or W (F,2,P) as for `paul train`;
          optional visible (N,P), confidence (N,P), frame (N,) and person (N,)
-  .csv   a row for each keypoint, with the columns frame,keypoint,x,y and optional person,confidence;
+  .csv   a row for each keypoint; columns frame,keypoint,x,y and optional person,confidence;
          keypoint is a name or, with --layout, a number from 0 on; rows are sorted by frame;
          a keypoint is hidden if it has no row, or no x and y
-  .json  [frame, ...], a frame is [person, ...], a person is [keypoint, ...] or {"id": ..., "keypoints": ...},
-         a keypoint is [x, y], [x, y, confidence] or null; or x, y, confidence in one row for all, as in COCO
+  .json  a list of frames; a frame is a list of persons;
+         a person is a list of keypoints, or {"id": "7", "keypoints": [...]};
+         a keypoint is [x, y], [x, y, confidence] or null;
+         keypoints may also be one flat list x, y, confidence, x, y, ... as in COCO
 
 output, in the optical frame of the camera (x right, y down, z forward):
   points (N,P,3), root (N,3), distance_sigma (N,) in metres, ambiguity (N,) in 0..1,
   certified (N,), reason (N,): empty if the person was lifted; frame and person as in the input;
   units (m or model), layout, keypoints (their names), coordinate_frame, model, model_sha256
   .npz   arrays of these names
-  .csv   a row for each keypoint: frame,person,keypoint,x,y,z,root_x,root_y,root_z,ambiguity,...,units
+  .csv   a row for each keypoint: frame,person,keypoint,x,y,z,root_x,root_y,root_z,ambiguity,
+         certified,distance_sigma,reason,units
   .json  one object; a person is an object in `persons`
 
 The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that camera_calibration
@@ -65,7 +68,7 @@ def add_parser(commands: Commands) -> None:
         help="lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
         description=_DESCRIPTION,
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("input", metavar="IN", type=Path, help="2D keypoints: .npz, .csv, .json, or - (standard input)")
     parser.add_argument(

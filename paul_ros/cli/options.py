@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -13,10 +14,15 @@ if TYPE_CHECKING:
 else:
     Commands = argparse._SubParsersAction
 
-RAW = argparse.RawDescriptionHelpFormatter
-"""Keeps the line breaks of a command's examples."""
-
 _PICTURES = (".png", ".svg", ".pdf")
+
+
+class HelpFormatter(argparse.HelpFormatter):
+    """Wraps plain paragraphs of a description to the terminal; keeps those with indented lines, such as examples."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = text.strip("\n").split("\n\n")
+        return "\n\n".join(part if "\n " in part else textwrap.fill(part, width) for part in paragraphs)
 
 
 def add_json(parser: argparse.ArgumentParser, what: str = "the report") -> None:

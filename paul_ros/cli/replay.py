@@ -7,13 +7,12 @@ import argparse
 from pathlib import Path
 
 from paul_ros.cli.options import (
-    RAW,
     Commands,
+    HelpFormatter,
     add_json,
     add_model,
     add_output_layout,
     add_person_height,
-    add_plot,
     add_topics,
 )
 from paul_ros.cli.output import check_files, publish
@@ -40,7 +39,7 @@ def add_parser(commands: Commands) -> None:
         help="lift a recorded bag and judge it",
         description=_DESCRIPTION,
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("bag", metavar="BAG", type=Path, help=".mcap file or rosbag2 folder")
     parser.add_argument(
@@ -51,7 +50,9 @@ def add_parser(commands: Commands) -> None:
         help="write the lifted bag: /lifter/poses, bodies, keypoints3d, markers, layout, and the input topics",
     )
     add_json(parser)
-    add_plot(parser, "frames over their truth, and errors over time")
+    parser.add_argument(
+        "--plot", metavar="FILE.png", type=Path, help="draw frames over their truth, and errors over time"
+    )
     add_model(parser)
     parser.add_argument(
         "--layout", help="layout of the bag's keypoints: a name or a .yaml file (default: found from the messages)"

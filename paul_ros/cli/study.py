@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from paul_ros.cli.options import RAW, Commands, add_runs, natural, numbers
+from paul_ros.cli.options import Commands, HelpFormatter, add_runs, natural, numbers
 from paul_ros.cli.output import check_files
 
 STUDIES = {
@@ -40,7 +40,7 @@ def add_parser(commands: Commands) -> None:
         help="answer one question about the method with a table and a picture",
         description="Answer one question about the method with a table and a picture.",
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     studies = parser.add_subparsers(metavar="NAME", required=True)
     for name, question in STUDIES.items():
@@ -64,7 +64,9 @@ def add_parser(commands: Commands) -> None:
 
 def _add_study(studies: Commands, name: str, question: str) -> argparse.ArgumentParser:
     description = f"{question[0].upper()}{question[1:]}."
-    parser = studies.add_parser(name, help=question, description=description, epilog=_EPILOG, formatter_class=RAW)
+    parser = studies.add_parser(
+        name, help=question, description=description, epilog=_EPILOG, formatter_class=HelpFormatter
+    )
     parser.add_argument("--data", metavar="FILE", type=Path, nargs="+", required=True, help="npz files, see below")
     parser.add_argument(
         "-o", "--output", metavar="FOLDER", type=Path, required=True, help="folder of table, picture and runs"

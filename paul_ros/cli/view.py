@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from paul_ros.cli.options import RAW, Commands, add_model, add_topics, seconds
+from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_topics, seconds
 from paul_ros.cli.output import check_files
 from paul_ros.cli.progress import drawing
 
@@ -31,7 +31,7 @@ def add_parser(commands: Commands) -> None:
         help="draw a film of a bag, lifted, or of a model's shapes",
         description="Draw a film of a bag, lifted through the code of the node, or of a model's shapes.",
         epilog=_EPILOG,
-        formatter_class=RAW,
+        formatter_class=HelpFormatter,
     )
     parser.add_argument("thing", metavar="THING", help=".mcap file, rosbag2 folder, model file or shipped model")
     parser.add_argument(
