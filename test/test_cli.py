@@ -156,7 +156,7 @@ def test_replay(model_file, tmp_path):
     ],
 )
 def test_nobody_lifted_is_no_success(layout, shown, clue, model_file, tmp_path, capsys, bag_make):
-    """Whether messages could not be used or persons could not be lifted, and although there are frames of nobody."""
+    """A bag of frames without persons, of unusable messages or of persons with too few keypoints is an error."""
     with BagWriter(tmp_path / "x.mcap") as writer:
         for second, persons in enumerate((0, 1)):
             xy = seen(persons_at(*[(0, 0, 4)] * persons))

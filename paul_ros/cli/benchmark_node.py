@@ -15,13 +15,13 @@ the baseline: it makes a PoseArray of as many poses from the same message, and l
 take turns of about two seconds.
 
 columns, a line for each number of persons, rate and node; times in µs:
-  received  messages that a PoseArray answered, of those sent
-  median    from the publisher's stamp to the arrival of the answer at the listener, which takes
+  received: messages that a PoseArray answered, of those sent
+  median:   from the publisher's stamp to the arrival of the answer at the listener, which takes
             serialised messages; then the 99th percentile
-  CPU       time that all threads of the node's process used, per frame
-  MB        resident memory after the last frame
-  x echo    the median over the echo node's; then the same for the 99th percentiles
-  + CPU     CPU time minus that of the echo node
+  CPU:      time that all threads of the node's process used, per frame
+  MB:       resident memory after the last frame
+  x echo:   the median over the echo node's; then the same for the 99th percentiles
+  + CPU:    CPU time minus that of the echo node
 
 Start to first output counts from the start of the process, with a detector already running: median of three.
 

@@ -15,12 +15,12 @@ A sequence is an npz file of the folder with W (F,2,P) and the truth S (F,3,P) i
 The trainer gets W and visible, with the frames shuffled by the seed. The truth judges the result.
 
 methods:
-  paul          encoder and decoder
-  adl           its decoder alone
-  adl_low_rank  its decoder alone, with a nuclear norm
-  linear        the linear model that the search starts from
-  rigid         one shape for all frames
-  RECIPE        name or YAML file of a recipe of your own
+  paul:         encoder and decoder
+  adl:          its decoder alone
+  adl_low_rank: its decoder alone, with a nuclear norm
+  linear:       the linear model that the search starts from
+  rigid:        one shape for all frames
+  RECIPE:       name or YAML file of a recipe of your own
 
 The work folder keeps every finished run. The same command continues an interrupted benchmark, and trains
 only runs that are missing. Other settings, data or versions of this package are other runs. Use --fresh

@@ -33,9 +33,8 @@ def main(argv: list[str] | None = None) -> int:
         argv: words after `paul`; None takes those of the process.
 
     Returns:
-        The exit code: 0 only on success, 1 for an error that the user can mend (one line on standard error),
-        130 after an interrupt, 141 if the reader of standard output has gone (`paul ... | head`). 141 is the code that
-        a shell gives a process that SIGPIPE ended.
+        The exit code. 0: success. 1: an error that the user can mend, one line on standard error. 130: interrupted.
+        141: the reader of standard output has gone (`paul ... | head`), as a shell reports SIGPIPE.
     """
     try:
         try:

@@ -31,27 +31,29 @@ The points are in metres from the camera if a camera is given, otherwise in mode
 """
 _EPILOG = """\
 input, N persons of P keypoints in pixels (x right, y down), NaN where hidden:
-  .npz   keypoints (N,P,2), or (N,P,3) with the confidences, or W (F,2,P) as for `paul train`;
-         optional visible (N,P), confidence (N,P), frame (N,) and person (N,)
-  .csv   a row for each keypoint; columns frame,keypoint,x,y and optional person,confidence;
-         keypoint is a name or, with --layout, a number from 0 on; rows are sorted by frame;
-         a keypoint is hidden if it has no row, or no x and y
-  .json  a list of frames; a frame is a list of persons;
-         a person is a list of keypoints, or {"id": "7", "keypoints": [...]};
-         a keypoint is [x, y], [x, y, confidence] or null;
-         keypoints may also be one flat list x, y, confidence, x, y, ... as in COCO
+  npz:   keypoints (N,P,2), or (N,P,3) with the confidences, or W (F,2,P) as for `paul train`;
+         optional visible (N,P), confidence (N,P), frame (N,) and person (N,).
+  csv:   a row for each keypoint, with columns frame,keypoint,x,y and optional person,confidence.
+         A keypoint is a name or, with --layout, a number from 0 on. Rows are sorted by frame.
+         A keypoint is hidden if it has no row, or no x and y.
+  json:  a list of frames; a frame is a list of persons.
+         A person is a list of keypoints, or {"id": "7", "keypoints": [...]}.
+         A keypoint is [x, y], [x, y, confidence] or null.
+         The keypoints may also be one flat list x, y, confidence, x, y, ... as in COCO.
 
 output, in the optical frame of the camera (x right, y down, z forward):
-  points (N,P,3), root (N,3), distance_sigma (N,) in metres, ambiguity (N,) in 0..1,
-  certified (N,), reason (N,): empty if the person was lifted; frame and person as in the input;
-  units (m or model), layout, keypoints (their names), coordinate_frame, model, model_sha256
-  .npz   arrays of these names
-  .csv   a row for each keypoint: frame,person,keypoint,x,y,z,root_x,root_y,root_z,ambiguity,
-         certified,distance_sigma,reason,units
-  .json  one object; a person is an object in `persons`
+  points:          (N,P,3), and root: (N,3)
+  distance_sigma:  (N,) standard deviation of the root's distance in metres
+  ambiguity:       (N,) 0..1; near 1 the depth-reversed pose fits the image as well
+  certified:       (N,) whether the pose is proven to be the optimum
+  reason:          (N,) why a person was not lifted; empty if it was
+  units:           `m` or `model`
+  stated too:      frame, person, layout, keypoints (their names), coordinate_frame, model
+A csv has a row for each keypoint, with root_x, root_y, root_z. In json, `persons` is a list of objects.
 
-The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that camera_calibration
-wrote, or JSON: {"K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], "width": 1280, "height": 720}.
+The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that camera_calibration wrote, or JSON
+such as:
+  {"K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], "width": 1280, "height": 720}
 
 examples:
   paul lift keypoints.npz -o lifted.npz --camera camera.yaml

@@ -60,8 +60,8 @@ def add_output_layout(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--output-layout",
         metavar="LAYOUT",
-        help="layout of the output: a name, a .yaml file, or `model` for all points of the model "
-        "(default: the input's, or the model's if that lacks a point of the input's)",
+        help="layout of the output: a name, a .yaml file, or `model` for all of its points "
+        "(default: the input's, or the model's if that lacks a point of it)",
     )
 
 

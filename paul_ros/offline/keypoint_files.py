@@ -315,10 +315,10 @@ def _json_person(person: Any, frame: int, place: int) -> tuple[str, np.ndarray]:
         ) from None
 
 
-def _json_keypoint(keypoint: Any) -> list[float]:
+def _json_keypoint(keypoint: Any) -> list[float | None]:
     if keypoint is None:
-        return [np.nan, np.nan, 0.0]
-    if not isinstance(keypoint, list) or len(keypoint) not in (2, 3):
+        return [None, None, 0.0]
+    if not isinstance(keypoint, list) or len(keypoint) not in (2, 3) or any(isinstance(x, str) for x in keypoint):
         raise ValueError
     return keypoint if len(keypoint) == 3 else [*keypoint, 1.0]
 

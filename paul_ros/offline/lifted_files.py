@@ -28,7 +28,7 @@ _CSV_COLUMNS = "frame,person,keypoint,x,y,z,root_x,root_y,root_z,ambiguity,certi
 
 @dataclass(frozen=True)
 class LiftedFile:
-    """What the output of lifted arrays is made with.
+    """A file of lifted persons, before it is written.
 
     Attributes:
         layout: of the points.
