@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -457,6 +458,22 @@ def test_nobody_lifted_is_no_success(model_file, tmp_path, capsys):
     assert lift(source, tmp_path / "out.json", model_file) == 1
     assert f"{source}: nobody could be lifted (3 too_few_points): check --layout" in capsys.readouterr().err
     assert [person["points"] for person in json.loads((tmp_path / "out.json").read_text())["persons"]] == [None] * 3
+
+
+def test_a_full_disk_is_one_line(persons, model_file, tmp_path):
+    """Here the largest file that the process may write."""
+    source = npz(tmp_path / "in.npz", keypoints=np.tile(persons, (200, 1, 1)))
+    words = ["lift", source, "-o", tmp_path / "out.csv", "--model", model_file]
+    done = subprocess.run(
+        [sys.executable, "-m", "paul_ros.cli", *map(str, words)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000)),
+    )
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert "File too large" in done.stderr and str(tmp_path / "out.csv") in done.stderr
+    assert list(tmp_path.iterdir()) == [source]
 
 
 @pytest.mark.parametrize("source", ["nowhere.npz", "nowhere.csv"])

@@ -49,10 +49,11 @@ output, in the optical frame of the camera (x right, y down, z forward):
   reason:          (N,) why a person was not lifted; empty if it was
   units:           `m` or `model`
   stated too:      frame, person, layout, keypoints (their names), coordinate_frame, model
-A csv has a row for each keypoint, with root_x, root_y, root_z. In json, `persons` is a list of objects.
+A csv has a row for each keypoint, with root_x, root_y, root_z. In json, `persons` is a list of
+objects.
 
-The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that camera_calibration wrote, or JSON
-such as:
+The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that
+camera_calibration wrote, or JSON such as:
   {"K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], "width": 1280, "height": 720}
 
 examples:
@@ -117,7 +118,7 @@ def run(args: argparse.Namespace) -> None:
     kinds = [_kind(args, path, name) for path, name in ((args.input, "IN"), (args.output, "OUT"))]
     from paul_ros.lifter import Lifter
     from paul_ros.model import load_model
-    from paul_ros.offline.keypoint_files import KeypointFileError
+    from paul_ros.offline.arrays import KeypointFileError
     from paul_ros.stream.parameters import checked
 
     check_files([args.output], [args.input, args.model, args.layout, args.output_layout, args.camera])

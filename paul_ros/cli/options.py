@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import textwrap
 from pathlib import Path
@@ -18,11 +19,13 @@ _PICTURES = (".png", ".svg", ".pdf")
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Wraps plain paragraphs of a description to the terminal; keeps those with indented lines, such as examples."""
+    """Wraps the prose of descriptions and epilogs to the terminal; keeps indented lines, such as examples."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        paragraphs = text.strip("\n").split("\n\n")
-        return "\n\n".join(part if "\n " in part else textwrap.fill(part, width) for part in paragraphs)
+        blocks = itertools.groupby(text.strip("\n").splitlines(), lambda line: bool(line) and not line[0].isspace())
+        return "\n".join(
+            textwrap.fill(" ".join(lines), width) if is_prose else "\n".join(lines) for is_prose, lines in blocks
+        )
 
 
 def add_json(parser: argparse.ArgumentParser, what: str = "the report") -> None:

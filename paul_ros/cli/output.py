@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import sys
@@ -14,6 +15,8 @@ from typing import Any, BinaryIO
 
 STDOUT = Path("-")
 """As the FILE of an option: standard output."""
+
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | None]) -> None:
@@ -77,6 +80,8 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
             yield file
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         os.unlink(temporary)
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:  # which names no file
+            raise OSError(error.errno, error.strerror, str(path)) from error
         raise

@@ -11,12 +11,16 @@ import numpy as np
 
 from msg_adapters import Intrinsics
 from msg_adapters.keypoints import Keypoints2D, record
-from paul_ros.errors import LayoutError
+from paul_ros.errors import LayoutError, PaulError
 from paul_ros.layout import Layout, layout_names, load_layout
 from paul_ros.lifter import Lifted, Lifter
 from paul_ros.stream.route import MODEL, PREFERRED, Route
 
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
+
+
+class KeypointFileError(PaulError, ValueError):
+    """A file of 2D keypoints cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,12 @@ class Persons:
         """
         read = record(xy, confidence, person, _NO_HEADER, visible)
         return cls(frame, person, read.xy, read.confidence, read.visible)
+
+    @classmethod
+    def stacked(cls, frame: list[int], person: list[str], keypoints: list[np.ndarray]) -> Persons:
+        """Stack N persons' x, y, confidence, arrays (P,3); NaN where hidden."""
+        every = np.stack(keypoints)
+        return cls.of(np.array(frame), tuple(person), every[..., :2], every[..., 2])
 
 
 def layout_of(points: int, model: Layout) -> Layout:
