@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import importlib
 import os
 import signal
@@ -105,6 +104,8 @@ def _check_command(parser: argparse.ArgumentParser, argv: list[str]) -> None:
     word = argv[0] if argv else ""
     if not word or word.startswith("-") or word in COMMANDS:
         return
+    import difflib
+
     close = difflib.get_close_matches(word.lower(), COMMANDS, n=1)
     hint = f", did you mean '{close[0]}'?" if close else "."
     parser.error(f"no command '{word}'{hint} The commands are {', '.join(COMMANDS)}")

@@ -165,7 +165,7 @@ def picture_path(text: str) -> Path:
     """Parse the path of a picture."""
     path = Path(text)
     if path.suffix not in _PICTURES:
-        raise argparse.ArgumentTypeError(f"'{text}' does not end in .png, .svg or .pdf")
+        raise argparse.ArgumentTypeError(f"'{text}' ends neither in .png nor in .svg or .pdf")
     return path
 
 

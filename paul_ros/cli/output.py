@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -47,6 +45,8 @@ def publish(
         json_file: FILE of --json; STDOUT prints JSON in place of the table, so that standard output holds nothing else.
         draw: writes the picture.
     """
+    import json
+
     from paul_ros.offline.report import write_json
 
     to_stdout = json_file == STDOUT
@@ -68,6 +68,8 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: the file cannot be written; names it.
     """
+    import tempfile
+
     if path == STDOUT:
         if sys.stdout is None:
             raise OSError("standard output is closed: name a file")
