@@ -15,7 +15,7 @@ from conftest import header_of, persons_at, seen
 
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros import __version__, cli
-from paul_ros.cli.launcher import COMMANDS
+from paul_ros.cli.launcher import COMMANDS, build_parser
 from paul_ros.cli.progress import progress
 from paul_ros.offline.bag import BagWriter
 
@@ -54,7 +54,21 @@ def test_help_names_every_command(capsys):
     with pytest.raises(SystemExit):
         cli.main(["--help"])
     text = capsys.readouterr().out
-    assert [name for name in COMMANDS if f"\n  {name}" not in text and f"\n    {name}" not in text] == []
+    assert [name for name in COMMANDS if f"\n    {name}" not in text] == []
+    assert [line for line in COMMANDS.values() if line not in " ".join(text.split())] == []
+
+
+def test_every_module_of_a_command_is_a_command():
+    own = {"launcher", "options", "output", "progress"}
+    files = {file.stem for file in (ROOT / "paul_ros" / "cli").glob("[a-z]*.py")} - own
+    assert {name for name in files if not name.startswith("benchmark_")} == set(COMMANDS) - {"train"}
+
+
+def test_one_parser_has_the_arguments_of_every_command():
+    """For the documentation, which prints them."""
+    (commands,) = [action.choices for action in build_parser()._actions if action.choices]
+    assert list(commands) == list(COMMANDS)
+    assert all(parser.description and len(parser._actions) > 1 for parser in commands.values())
 
 
 def test_version(capsys):

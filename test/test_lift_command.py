@@ -403,7 +403,7 @@ BAD = [
         json.dumps([[[[1, 2]] * 17], [[[1, 2]] * 16]]),
         "frame 1, person 0: 16 keypoints, but layout 'coco17' has",
     ),
-    ("npz", "", "holds pickled objects or is no npz"),
+    ("npz", "", "pickled objects or is no npz"),
     ("npz", {"points": np.ones((1, 17, 2))}, "has neither keypoints (N,P,2) nor W (F,2,P)"),
     ("npz", {"keypoints": np.ones((17, 2))}, "keypoints is (17, 2); it must be (N,P,2)"),
     ("npz", {"keypoints": np.ones((1, 17, 4))}, "keypoints is (1, 17, 4)"),
@@ -412,7 +412,7 @@ BAD = [
     ("npz", {"keypoints": np.ones((1, 19, 2))}, "no shipped layout of 19 keypoints fits"),
     ("npz", {"keypoints": np.ones((1, 17, 2), complex)}, "keypoints has type complex128; it must be number"),
     ("npz", {"keypoints": np.full((1, 17, 2), "a")}, "keypoints has type <U1; it must be number"),
-    ("npz", {"keypoints": np.full((1, 17, 2), None)}, "holds pickled objects"),
+    ("npz", {"keypoints": np.full((1, 17, 2), None)}, "pickled objects"),
     ("npz", {"keypoints": np.ones((2, 17, 2)), "visible": np.ones(17)}, "visible is (17,); it must be (2, 17)"),
     ("npz", {"keypoints": np.ones((2, 17, 2)), "frame": np.ones(2)}, "frame has type float64; it must be integer"),
 ]

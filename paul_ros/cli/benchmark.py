@@ -9,9 +9,7 @@ from paul_ros.cli.options import Commands
 
 def add_parser(commands: Commands) -> None:
     """Add the command with its subjects."""
-    parser = commands.add_parser(
-        "benchmark", help="measure this package against others", description="Measure this package against others."
-    )
+    parser = commands.add_parser("benchmark", description="Measure this package against others.")
     subjects = parser.add_subparsers(metavar="SUBJECT", required=True)
     for subject in (benchmark_onp, benchmark_nrsfm, benchmark_node):
         subject.add_parser(subjects)

@@ -13,7 +13,6 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "demo",
-        help="run the real node on the shipped bags and check it",
         description="Start the ROS 2 node and play the shipped bags to it over DDS in real time. Record what it "
         "publishes, and check that against the ground truth and against `paul replay`.",
     )

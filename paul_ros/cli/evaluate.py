@@ -36,7 +36,6 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "evaluate",
-        help="judge a model on unseen frames, or a reconstruction, against the 3D truth",
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=HelpFormatter,

@@ -20,7 +20,6 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "inspect",
-        help="summarise a model, a bag or a layout",
         description="Summarise a model, a bag or a keypoint layout.",
         epilog=_EPILOG,
         formatter_class=HelpFormatter,

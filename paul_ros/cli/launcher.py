@@ -8,20 +8,35 @@ import importlib
 import os
 import signal
 import sys
+from collections.abc import Collection
 
 from paul_ros import __version__
 from paul_ros.cli.options import Commands, HelpFormatter
 
-COMMANDS = ("lift", "replay", "view", "inspect", "train", "evaluate", "study", "demo", "benchmark")
-"""Modules of this package, in the order of `paul --help`; each has `add_parser(commands)`."""
+COMMANDS = {
+    "lift": "lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
+    "replay": "lift a recorded bag and judge it",
+    "view": "draw a film of a bag, lifted, or of a model's shapes",
+    "inspect": "summarise a model, a bag or a layout",
+    "train": "learn a 3D model of any object from 2D keypoints alone",
+    "evaluate": "judge a model on unseen frames, or a reconstruction, against the 3D truth",
+    "study": "answer one question about the method with a table and a picture",
+    "demo": "run the real node on the shipped bags and check it",
+    "benchmark": "measure this package against others",
+}
+"""Modules of this package, each with `add_parser(commands)`, and their lines in `paul --help`."""
 
 _OWN_THREADS = "train"  # has --threads
 
 _EPILOG = """\
 `paul COMMAND --help` explains a command.
 
-exit codes: 0 success; 1 an error that you can mend, explained in one line; 2 wrong usage;
-130 interrupted by Ctrl-C; 141 the reader of standard output has gone
+exit codes:
+  0:   success
+  1:   an error that you can mend, explained in one line on standard error
+  2:   wrong usage
+  130: interrupted by Ctrl-C
+  141: the reader of standard output has gone
 """
 
 
@@ -49,7 +64,9 @@ def _run(argv: list[str]) -> int:
     if argv[:1] != [_OWN_THREADS]:
         _use_one_thread()
     try:
-        args = _parser(argv).parse_args(argv)
+        parser = build_parser(argv)
+        _check_command(parser, argv)
+        args = parser.parse_args(argv)
         args.run(args)
     except KeyboardInterrupt as stop:
         print(f"paul: {str(stop) or 'stopped'}", file=sys.stderr)
@@ -64,7 +81,13 @@ def _run(argv: list[str]) -> int:
     return 0
 
 
-def _parser(argv: list[str]) -> argparse.ArgumentParser:
+def build_parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """Build the parser of `paul`.
+
+    Args:
+        wanted: words that include the commands to be parsed. The others get no arguments, and their modules are not
+            imported, which saves time.
+    """
     parser = argparse.ArgumentParser(
         prog="paul",
         description="Lift the 2D keypoints of any object to 3D, with a model that is learned from 2D alone.",
@@ -73,23 +96,18 @@ def _parser(argv: list[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"paul_ros {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name in COMMANDS:
-        if name == "train":
-            _add_train(commands, wanted=argv[:1] == ["train"])
+    for name, line in COMMANDS.items():
+        if name not in wanted:
+            commands.add_parser(name, help=line)
+        elif name == "train":
+            _add_train(commands)
         else:
             importlib.import_module(f"paul_ros.cli.{name}").add_parser(commands)
-    _check_command(parser, argv)
     return parser
 
 
-def _add_train(commands: Commands, wanted: bool) -> None:
-    parser = commands.add_parser(
-        "train",
-        help="learn a 3D model of any object from 2D keypoints alone",
-        description="Learn a 3D shape model from 2D keypoints alone.",
-    )
-    if not wanted:
-        return  # its options live beside torch, which takes seconds to import
+def _add_train(commands: Commands) -> None:
+    parser = commands.add_parser("train", description="Learn a 3D shape model from 2D keypoints alone.")
     from paul_ros.extras import require
 
     require("train", "torch", "tqdm")
@@ -106,7 +124,7 @@ def _check_command(parser: argparse.ArgumentParser, argv: list[str]) -> None:
         return
     import difflib
 
-    close = difflib.get_close_matches(word.lower(), COMMANDS, n=1)
+    close = difflib.get_close_matches(word.lower(), list(COMMANDS), n=1)
     hint = f", did you mean '{close[0]}'?" if close else "."
     parser.error(f"no command '{word}'{hint} The commands are {', '.join(COMMANDS)}")
 

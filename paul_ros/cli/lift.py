@@ -68,7 +68,6 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "lift",
-        help="lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=HelpFormatter,

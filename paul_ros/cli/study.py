@@ -37,7 +37,6 @@ def add_parser(commands: Commands) -> None:
     """Add the command with its studies."""
     parser = commands.add_parser(
         "study",
-        help="answer one question about the method with a table and a picture",
         description="Answer one question about the method with a table and a picture.",
         epilog=_EPILOG,
         formatter_class=HelpFormatter,

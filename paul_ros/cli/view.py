@@ -28,7 +28,6 @@ def add_parser(commands: Commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "view",
-        help="draw a film of a bag, lifted, or of a model's shapes",
         description="Draw a film of a bag, lifted through the code of the node, or of a model's shapes.",
         epilog=_EPILOG,
         formatter_class=HelpFormatter,
