@@ -13,11 +13,11 @@ from paul_ros.cli.progress import progress
 _DESCRIPTION = "Judge a model on frames it never saw, each lifted alone, or judge a saved reconstruction."
 _EPILOG = """\
 DATA is an npz with
-  W (F,2,P):       image points, y down; S and W share one scale
-  S (F,3,P):       the truth in the camera frame; NaN where it is unknown
-  visible (F,P):   optional; the model sees visible points only, errors cover all points
-  edges (E,2):     optional, for the picture
-  metres:          optional, true: distances are given in mm, otherwise in units of W
+  W:        (F,2,P) image points, y down; S and W share one scale
+  S:        (F,3,P) the truth in the camera frame; NaN where it is unknown
+  visible:  (F,P) optional; the model sees visible points only, errors cover all points
+  edges:    (E,2) optional, for the picture
+  metres:   optional; if true, distances are given in mm, otherwise in units of W
 
 examples:
   paul evaluate person.npz unseen.npz --json errors.json --plot errors.png
