@@ -15,6 +15,8 @@ from conftest import header_of, persons_at, seen
 
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros import __version__, cli
+from paul_ros.cli.launcher import COMMANDS, build_parser
+from paul_ros.cli.progress import progress
 from paul_ros.offline.bag import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -35,21 +37,38 @@ def paul(*arguments):
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--help"],
-        ["replay", "--help"],
-        ["inspect", "--help"],
-        ["demo", "--help"],
-        ["train", "--help"],
-        ["benchmark", "--help"],
-    ],
+    "words", [[], *([name] for name in COMMANDS), *(["benchmark", subject] for subject in ("onp", "nrsfm", "node"))]
 )
-def test_help(arguments, capsys):
+def test_help(words, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit) as end:
-        cli.main(arguments)
+        cli.main([*words, "--help"])
     assert end.value.code == 0
-    assert capsys.readouterr().out.startswith("usage: paul")
+    text = capsys.readouterr().out
+    assert text.startswith("usage: paul")
+    if words != ["train"]:
+        assert max(map(len, text.splitlines())) <= 100
+
+
+def test_help_names_every_command(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    text = capsys.readouterr().out
+    assert [name for name in COMMANDS if f"\n    {name}" not in text] == []
+    assert [line for line in COMMANDS.values() if line not in " ".join(text.split())] == []
+
+
+def test_every_module_of_a_command_is_a_command():
+    own = {"launcher", "options", "output", "progress"}
+    files = {file.stem for file in (ROOT / "paul_ros" / "cli").glob("[a-z]*.py")} - own
+    assert {name for name in files if not name.startswith("benchmark_")} == set(COMMANDS) - {"train"}
+
+
+def test_one_parser_has_the_arguments_of_every_command():
+    """For the documentation, which prints them."""
+    (commands,) = [action.choices for action in build_parser()._actions if action.choices]
+    assert list(commands) == list(COMMANDS)
+    assert all(parser.description and len(parser._actions) > 1 for parser in commands.values())
 
 
 def test_version(capsys):
@@ -126,6 +145,13 @@ def test_wrong_usage(arguments, capsys):
     assert end.value.code == 2 and "usage: paul" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("word, near", [("reply", "replay"), ("Lift", "lift"), ("benchmarks", "benchmark")])
+def test_a_mistyped_command_is_answered_by_the_nearest(word, near, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main([word])
+    assert end.value.code == 2 and f"no command '{word}', did you mean '{near}'?" in capsys.readouterr().err
+
+
 def test_replay(model_file, tmp_path):
     files = tmp_path / "out.mcap", tmp_path / "r.json", tmp_path / "p.png"
     done = paul("replay", ONE, "--model", model_file, "-o", files[0], "--json", files[1], "--plot", files[2])
@@ -144,7 +170,7 @@ def test_replay(model_file, tmp_path):
     ],
 )
 def test_nobody_lifted_is_no_success(layout, shown, clue, model_file, tmp_path, capsys, bag_make):
-    """Whether messages could not be used or persons could not be lifted, and although there are frames of nobody."""
+    """A bag of frames without persons, of unusable messages or of persons with too few keypoints is an error."""
     with BagWriter(tmp_path / "x.mcap") as writer:
         for second, persons in enumerate((0, 1)):
             xy = seen(persons_at(*[(0, 0, 4)] * persons))
@@ -198,9 +224,34 @@ def test_error_is_one_line(arguments, clue, model_file, capsys):
 
 
 def test_fault_of_the_program_is_not_hidden(monkeypatch):
-    monkeypatch.setattr(cli, "_inspect", lambda args: 1 / 0)
+    monkeypatch.setattr("paul_ros.cli.inspect.run", lambda args: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli.main(["inspect", "coco17"])
+
+
+def test_an_import_of_the_program_that_fails_is_a_fault(monkeypatch):
+    """Only MissingPackageError tells the user what to install."""
+    monkeypatch.setitem(sys.modules, "paul_ros.offline.inspection", None)
+    with pytest.raises(ImportError):
+        cli.main(["inspect", "coco17"])
+
+
+@pytest.mark.parametrize(
+    "words, module, extra",
+    [
+        (["study", "noise", "--data", "x.npz", "-o", "OUT"], "torch", "train"),
+        (["study", "noise", "--data", "x.npz", "-o", "OUT"], "matplotlib", "benchmark"),
+        (["evaluate", "x.npz", "--truth", "y.npz"], "torch", "train"),
+        (["evaluate", "human", "y.npz", "--plot", "OUT/p.png"], "matplotlib", "benchmark"),
+        (["benchmark", "nrsfm", "--data", "OUT", "--work", "OUT"], "torch", "train"),
+        (["benchmark", "node", "--plot", "OUT/p.png"], "matplotlib", "benchmark"),
+    ],
+)
+def test_a_missing_package_is_one_line(words, module, extra, monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert cli.main([word.replace("OUT", str(tmp_path)) for word in words]) == 1
+    error = capsys.readouterr().err
+    assert f"'{module}' is missing: pip install 'paul_ros[{extra}]'" in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -241,6 +292,56 @@ def test_inspect_a_damaged_bag(tmp_path, capsys):
     assert cli.main(["inspect", str(half)]) == 1
     printed = capsys.readouterr()
     assert "/keypoints" in printed.out and "damaged after" in printed.err
+
+
+def test_json_on_standard_output_is_all_that_is_there(model_file):
+    """So that `paul replay BAG --json - | python -m json.tool` works."""
+    done = paul("replay", ONE, "--model", model_file, "--json", "-")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["lifted"] == 585
+
+
+@pytest.mark.parametrize("thing", ["coco17", "human", ONE])
+def test_json_on_standard_output_is_that_of_the_file(thing, tmp_path, capsys):
+    assert cli.main(["inspect", str(thing), "--json", str(tmp_path / "s.json")]) == 0
+    table = capsys.readouterr().out
+    assert cli.main(["inspect", str(thing), "--json", "-"]) == 0
+    printed = capsys.readouterr().out
+    assert printed == (tmp_path / "s.json").read_text() and printed != table
+
+
+def test_json_on_standard_output_of_a_benchmark(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("paul_ros.benchmarks.onp.run", lambda *settings: {"rows": list(settings)})
+    monkeypatch.setattr("paul_ros.benchmarks.onp_report.table", lambda report: pytest.fail("a table beside the JSON"))
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["benchmark", "onp", "--cases", "3", "--batch", "4", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"rows": [3, 4, 0]}
+    assert list(tmp_path.iterdir()) == []  # no file named "-"
+
+
+@pytest.mark.parametrize("watched", [False, True])
+def test_a_bar_is_shown_only_where_a_terminal_watches(watched, monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: watched, raising=False)
+    with progress("replay", total=2) as count:
+        count(2)
+    assert ("replay" in capsys.readouterr().err) == watched
+
+
+def test_without_tqdm_there_is_no_bar(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("paul_ros.cli.progress.find_spec", lambda name: None)
+    with progress("replay") as count:
+        count(1)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_command_is_imported_without_numpy():
+    """The launcher sets the threads before NumPy starts; and `paul --help` is fast."""
+    code = (
+        'import sys, paul_ros.cli.launcher as launcher\ntry: launcher.main(["--help"])\nexcept SystemExit: pass\n'
+        'assert not {"numpy", "yaml", "tqdm", "rich"} & set(sys.modules)'
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
 
 
 def test_training_is_imported_only_to_train():

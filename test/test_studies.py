@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from paul_ros import cli
+from paul_ros.cli.study import STUDIES
 from paul_ros.layout import anonymous_layout
 from paul_ros.model_file import load_model, save_model, weight_shapes
 from training import reconstruction
@@ -237,8 +238,8 @@ def test_two_files_of_one_name_are_refused(files, tmp_path, fake, capsys):
 
 
 def test_every_study_of_the_command_line_is_there(capsys):
-    assert set(cli._STUDIES) == set(studies())
-    for name in (*cli._STUDIES, "interpolation"):
+    assert set(STUDIES) == set(studies())
+    for name in (*STUDIES, "interpolation"):
         with pytest.raises(SystemExit) as end:
             cli.main(["study", name, "--help"])
         assert end.value.code == 0 and "examples:" in capsys.readouterr().out

@@ -3,7 +3,7 @@
 
 import sys
 
-from paul_ros.cli import main
+from paul_ros.cli.launcher import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Start `paul`: build the parser, set the threads, run a command, and turn errors into lines and exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Collection
+
+from paul_ros import __version__
+from paul_ros.cli.options import Commands, HelpFormatter
+
+COMMANDS = {
+    "lift": "lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
+    "replay": "lift a recorded bag and judge it",
+    "view": "draw a film of a bag, lifted, or of a model's shapes",
+    "inspect": "summarise a model, a bag or a layout",
+    "train": "learn a 3D model of any object from 2D keypoints alone",
+    "evaluate": "judge a model on unseen frames, or a reconstruction, against the 3D truth",
+    "study": "answer one question about the method with a table and a picture",
+    "demo": "run the real node on the shipped bags and check it",
+    "benchmark": "measure this package against others",
+}
+"""Modules of this package, each with `add_parser(commands)`, and their lines in `paul --help`."""
+
+_OWN_THREADS = "train"  # has --threads
+
+_EPILOG = """\
+`paul COMMAND --help` explains a command.
+
+exit codes:
+  0:   success
+  1:   an error that you can mend, explained in one line on standard error
+  2:   wrong usage
+  130: interrupted by Ctrl-C
+  141: the reader of standard output has gone
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `paul`.
+
+    Args:
+        argv: words after `paul`; None takes those of the process.
+
+    Returns:
+        The exit code. 0: success. 1: an error that the user can mend, one line on standard error. 130: interrupted.
+        141: the reader of standard output has gone (`paul ... | head`), as a shell reports SIGPIPE.
+    """
+    try:
+        try:
+            return _run(sys.argv[1:] if argv is None else argv)
+        finally:
+            print(end="", flush=True)  # here, since nothing catches a closed pipe at exit
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+
+
+def _run(argv: list[str]) -> int:
+    if argv[:1] != [_OWN_THREADS]:
+        _use_one_thread()
+    try:
+        parser = build_parser(argv)
+        _check_command(parser, argv)
+        args = parser.parse_args(argv)
+        args.run(args)
+    except KeyboardInterrupt as stop:
+        print(f"paul: {str(stop) or 'stopped'}", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        if not _is_expected(error):
+            raise
+        print(f"paul: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def build_parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """Build the parser of `paul`.
+
+    Args:
+        wanted: words that include the commands to be parsed. The others get no arguments, and their modules are not
+            imported, which saves time.
+    """
+    parser = argparse.ArgumentParser(
+        prog="paul",
+        description="Lift the 2D keypoints of any object to 3D, with a model that is learned from 2D alone.",
+        epilog=_EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"paul_ros {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, line in COMMANDS.items():
+        if name not in wanted:
+            commands.add_parser(name, help=line)
+        elif name == "train":
+            _add_train(commands)
+        else:
+            importlib.import_module(f"paul_ros.cli.{name}").add_parser(commands)
+    return parser
+
+
+def _add_train(commands: Commands) -> None:
+    parser = commands.add_parser("train", description="Learn a 3D shape model from 2D keypoints alone.")
+    from paul_ros.extras import require
+
+    require("train", "torch", "tqdm")
+    from training import command
+
+    command.add_arguments(parser)
+    parser.set_defaults(run=command.run)
+
+
+def _check_command(parser: argparse.ArgumentParser, argv: list[str]) -> None:
+    """Exit with the nearest command, if the first word is none; argparse suggests one from Python 3.14 on."""
+    word = argv[0] if argv else ""
+    if not word or word.startswith("-") or word in COMMANDS:
+        return
+    import difflib
+
+    close = difflib.get_close_matches(word.lower(), list(COMMANDS), n=1)
+    hint = f", did you mean '{close[0]}'?" if close else "."
+    parser.error(f"no command '{word}'{hint} The commands are {', '.join(COMMANDS)}")
+
+
+def _use_one_thread() -> None:
+    """Limit BLAS to one thread, as the node does, before NumPy starts.
+
+    A replay then agrees with the live node to the last bit.
+    """
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"
+
+
+def _is_expected(error: Exception) -> bool:
+    """Return whether the error has a text for the user; any other is a fault of the program and shows its traceback."""
+    from paul_ros.errors import PaulError
+
+    return isinstance(error, (PaulError, OSError))

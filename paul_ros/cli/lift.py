@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`paul lift`: arrays of 2D keypoints to 3D, without ROS."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_layout, add_person_height
+from paul_ros.cli.output import STDOUT, check_files, open_output
+from paul_ros.cli.progress import progress
+
+if TYPE_CHECKING:
+    from msg_adapters import Intrinsics
+    from paul_ros.lifter import Lifter
+    from paul_ros.offline.lifted_files import Batches
+
+FORMATS = ("npz", "csv", "json")
+
+_LIFTED = ""  # the reason of a lifted person
+_UNLIKE = "unlike_the_model"
+_UNLIKE_SHARE = 0.5  # of a person is not explained; the stream notes such persons too
+_DESCRIPTION = """\
+Lift arrays of 2D keypoints to 3D, each person alone, as the ROS 2 node does. No ROS is needed.
+The points are in metres from the camera if a camera is given, otherwise in model units from each person's root.
+"""
+_EPILOG = """\
+input, N persons of P keypoints in pixels (x right, y down), NaN where hidden:
+  npz:   keypoints (N,P,2), or (N,P,3) with the confidences, or W (F,2,P) as for `paul train`;
+         optional visible (N,P), confidence (N,P), frame (N,) and person (N,).
+  csv:   a row for each keypoint, with columns frame,keypoint,x,y and optional person,confidence.
+         A keypoint is a name or, with --layout, a number from 0 on. Rows are sorted by frame.
+         A keypoint is hidden if it has no row, or no x and y.
+  json:  a list of frames; a frame is a list of persons.
+         A person is a list of keypoints, or {"id": "7", "keypoints": [...]}.
+         A keypoint is [x, y], [x, y, confidence] or null.
+         The keypoints may also be one flat list x, y, confidence, x, y, ... as in COCO.
+
+output, in the optical frame of the camera (x right, y down, z forward):
+  points:          (N,P,3), and root: (N,3)
+  distance_sigma:  (N,) standard deviation of the root's distance in metres
+  ambiguity:       (N,) 0..1; near 1 the depth-reversed pose fits the image as well
+  certified:       (N,) whether the pose is proven to be the optimum
+  reason:          (N,) why a person was not lifted; empty if it was
+  units:           `m` or `model`
+  stated too:      frame, person, layout, keypoints (their names), coordinate_frame, model
+A csv has a row for each keypoint, with root_x, root_y, root_z. In json, `persons` is a list of
+objects.
+
+The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that
+camera_calibration wrote, or JSON such as:
+  {"K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], "width": 1280, "height": 720}
+
+examples:
+  paul lift keypoints.npz -o lifted.npz --camera camera.yaml
+  paul lift keypoints.csv -o lifted.csv --intrinsics 900 900 640 360
+  paul lift keypoints.json -o lifted.json --layout h36m17 --output-layout model
+  detector | paul lift - -o - --format csv --layout coco17 > lifted.csv
+"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "lift",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("input", metavar="IN", type=Path, help="2D keypoints: .npz, .csv, .json, or - (standard input)")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        type=Path,
+        required=True,
+        help="3D points: .npz, .csv, .json, or - (standard output)",
+    )
+    parser.add_argument("--format", choices=FORMATS, help="format of standard input and standard output")
+    parser.add_argument(
+        "--layout",
+        help="layout of the keypoints: a name or a .yaml file "
+        "(default: found from their number, or from their names in .csv)",
+    )
+    add_output_layout(parser)
+    camera = parser.add_mutually_exclusive_group()
+    camera.add_argument("--camera", metavar="FILE", type=Path, help="calibration of the camera (.yaml or .json)")
+    camera.add_argument(
+        "--intrinsics",
+        metavar=("FX", "FY", "CX", "CY"),
+        type=float,
+        nargs=4,
+        help="focal lengths and principal point in pixels",
+    )
+    add_model(parser)
+    add_person_height(parser)
+    parser.add_argument(
+        "--min-confidence",
+        metavar="C",
+        type=float,
+        help="keypoints with a lower confidence count as hidden (default: the node's, 0.3)",
+    )
+    parser.set_defaults(run=run, usage_error=parser.error)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Lift the file, write the output, print one line about it.
+
+    Raises:
+        PaulError: a file or a parameter cannot be used, or nobody could be lifted.
+    """
+    kinds = [_kind(args, path, name) for path, name in ((args.input, "IN"), (args.output, "OUT"))]
+    from paul_ros.lifter import Lifter
+    from paul_ros.model import load_model
+    from paul_ros.offline.arrays import KeypointFileError
+    from paul_ros.stream.parameters import checked
+
+    check_files([args.output], [args.input, args.model, args.layout, args.output_layout, args.camera])
+    given = {name: getattr(args, name) for name in ("model", "person_height", "min_confidence")}
+    parameters = checked({name: value for name, value in given.items() if value is not None})
+    lifter = Lifter(load_model(parameters["model"]), parameters["person_height"])
+    tally: Counter[str] = Counter()
+    summary = _lift(args, kinds, lifter, parameters["min_confidence"], tally)
+    if not tally[_LIFTED]:
+        name = "standard input" if args.input == STDOUT else args.input
+        raise KeypointFileError(f"{name}: nobody could be lifted ({_reasons(tally)}): check --layout and the keypoints")
+    print(summary, file=sys.stderr if args.output == STDOUT else sys.stdout)
+
+
+def _lift(
+    args: argparse.Namespace, kinds: list[str], lifter: Lifter, min_confidence: float, tally: Counter[str]
+) -> str:
+    """Lift from file to file; count persons in `tally` by reason. Return the line for the user."""
+    from paul_ros.layout import load_layout
+    from paul_ros.offline.arrays import lift_persons, route_of
+    from paul_ros.offline.keypoint_files import open_keypoints
+    from paul_ros.offline.lifted_files import LiftedFile
+
+    camera, model = _camera(args), lifter.model
+    units = "m" if camera and lifter.metres_per_unit else "model"
+    with _open_input(args.input) as file:
+        layout = load_layout(args.layout) if args.layout else None
+        name = "standard input" if args.input == STDOUT else str(args.input)
+        keypoints = open_keypoints(file, name, kinds[0], layout, model.layout)
+        route = route_of(keypoints.layout, model.layout, args.output_layout)
+        lifted = lift_persons(keypoints.batches, lifter, route, camera, min_confidence)
+        with open_output(args.output) as out, progress("lift", "person", keypoints.persons) as count:
+            LiftedFile(route.output, model, units).write(out, kinds[1], _counted(lifted, tally, count))
+    return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, camera, route.given.name)])
+
+
+def _counted(batches: Batches, tally: Counter[str], count: Callable[[int], None]) -> Batches:
+    """Yield the batches while their persons are counted by the reason why they were not lifted."""
+    for persons, lifted in batches:
+        tally.update(lifted.reason)
+        tally[_UNLIKE] += int((lifted.unexplained > _UNLIKE_SHARE).sum())
+        yield persons, lifted
+        count(len(lifted.reason))
+
+
+def _summary(args: argparse.Namespace, tally: Counter[str], layout: str, units: str) -> str:
+    persons = sum(number for reason, number in tally.items() if reason != _UNLIKE)
+    reasons = _reasons(tally)
+    output = "standard output" if args.output == STDOUT else args.output
+    return (
+        f"{output}: {tally[_LIFTED]} of {persons} persons lifted, layout {layout}, "
+        f"units {units}{f'; not lifted: {reasons}' if reasons else ''}"
+    )
+
+
+def _reasons(tally: Counter[str]) -> str:
+    left_out = sorted((reason, number) for reason, number in tally.items() if reason not in (_LIFTED, _UNLIKE))
+    return ", ".join(f"{number} {reason}" for reason, number in left_out)
+
+
+def _notes(tally: Counter[str], camera: Intrinsics | None, layout: str) -> list[str]:
+    notes = []
+    if camera is None:
+        notes.append("note: no camera, so lengths are in model units; name --camera or --intrinsics for metres")
+    elif camera.distorted:
+        notes.append(
+            "note: the camera has distortion but no P, so K is used: positions are a little wrong unless the keypoints "
+            "are of an undistorted image"
+        )
+    if tally[_UNLIKE]:
+        notes.append(
+            f"note: {tally[_UNLIKE]} persons hardly look like a shape of the model; if the keypoints are not in the "
+            f"order of layout {layout}, set --layout"
+        )
+    return notes
+
+
+def _kind(args: argparse.Namespace, path: Path, name: str) -> str:
+    """Return the format of a file by its suffix, or that of a standard stream by --format; exit on wrong usage."""
+    if path == STDOUT:
+        if not args.format:
+            args.usage_error(f"{name} is -: choose its format with --format npz, csv or json")
+        return args.format
+    if path.suffix.lstrip(".") not in FORMATS:
+        args.usage_error(f"{name} is '{path}': it must end in .npz, .csv or .json")
+    return path.suffix.lstrip(".")
+
+
+def _camera(args: argparse.Namespace) -> Intrinsics | None:
+    from paul_ros.offline.camera_file import camera_of, read_camera
+
+    if args.camera:
+        return read_camera(args.camera)
+    return camera_of(*args.intrinsics) if args.intrinsics else None
+
+
+@contextlib.contextmanager
+def _open_input(path: Path) -> Iterator[BinaryIO]:
+    """Open a file, or standard input, which stays open."""
+    if path != STDOUT:
+        with path.open("rb") as file:
+            yield file
+    elif sys.stdin is None:
+        raise OSError("standard input is closed: name a file")
+    else:
+        yield sys.stdin.buffer

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a command writes its results: files first, then standard output."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+STDOUT = Path("-")
+"""As the FILE of an option: standard output."""
+
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | None]) -> None:
+    """Refuse outputs that cannot be written, or that would overwrite an input or each other, before any work is done.
+
+    Raises:
+        BagError: names the file and what to do.
+    """
+    from paul_ros.offline.bag import check_outputs
+
+    check_outputs([path for path in outputs if path != STDOUT], inputs)
+
+
+def publish(
+    report: dict[str, Any],
+    table: Callable[[dict[str, Any]], str],
+    json_file: Path | None,
+    draw: Callable[[], object] | None = None,
+) -> None:
+    """Write a report and its picture, then print it.
+
+    Files come first, since the reader of standard output may stop reading. The table is printed even if the picture
+    fails, since the work was done.
+
+    Args:
+        report: the results, for JSON.
+        table: makes the text for people.
+        json_file: FILE of --json; STDOUT prints JSON in place of the table, so that standard output holds nothing else.
+        draw: writes the picture.
+    """
+    import json
+
+    from paul_ros.offline.report import write_json
+
+    to_stdout = json_file == STDOUT
+    if json_file and not to_stdout:
+        write_json(json_file, report)
+    try:
+        if draw:
+            draw()
+    finally:
+        print(json.dumps(report, indent=2, ensure_ascii=False) if to_stdout else table(report))
+
+
+@contextlib.contextmanager
+def open_output(path: Path) -> Iterator[BinaryIO]:
+    """Open a file that appears whole or not at all, or standard output.
+
+    For output that is written piece by piece; `paul_ros.files.write_atomically` writes what is in memory.
+
+    Raises:
+        OSError: the file cannot be written; names it.
+    """
+    import tempfile
+
+    if path == STDOUT:
+        if sys.stdout is None:
+            raise OSError("standard output is closed: name a file")
+        yield sys.stdout.buffer
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException as error:
+        os.unlink(temporary)
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:  # which names no file
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise

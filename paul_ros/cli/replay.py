@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`paul replay`: lift a recorded bag and judge it against its ground truth."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from paul_ros.cli.options import (
+    Commands,
+    HelpFormatter,
+    add_json,
+    add_model,
+    add_output_layout,
+    add_person_height,
+    add_topics,
+)
+from paul_ros.cli.output import check_files, publish
+from paul_ros.cli.progress import progress
+
+_DESCRIPTION = """\
+Lift every 2D keypoint message of a bag through the code of the node. Equal input gives equal output.
+The command prints a table of errors if the bag has a ground truth.
+"""
+_EPILOG = """\
+A damaged bag is lifted up to the damage. The exit code is then 1, and also if nobody could be lifted.
+
+examples:
+  paul replay recording.mcap -o lifted.mcap
+  paul replay recording.mcap --layout h36m17 --plot errors.png
+  paul replay recording.mcap --json - | python3 -m json.tool
+"""
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "replay",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=HelpFormatter,
+    )
+    parser.add_argument("bag", metavar="BAG", type=Path, help=".mcap file or rosbag2 folder")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.mcap",
+        type=Path,
+        help="write the lifted bag: /lifter/poses, bodies, keypoints3d, markers, layout, and the input topics",
+    )
+    add_json(parser)
+    parser.add_argument(
+        "--plot", metavar="FILE.png", type=Path, help="draw frames over their truth, and errors over time"
+    )
+    add_model(parser)
+    parser.add_argument(
+        "--layout", help="layout of the bag's keypoints: a name or a .yaml file (default: found from the messages)"
+    )
+    add_output_layout(parser)
+    add_person_height(parser)
+    parser.add_argument(
+        "--smoothing",
+        type=float,
+        metavar="HZ",
+        help="cut-off of a filter over time, the node's parameter `smoothing` (default: off)",
+    )
+    add_topics(parser)
+    parser.add_argument(
+        "--depth-topic",
+        default="/depth",
+        metavar="TOPIC",
+        help="topic of depth images aligned to the image of the keypoints (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--ground-truth-topic",
+        default="/ground_truth/poses",
+        metavar="TOPIC",
+        help="topic of the truth: PoseArray, metres, camera frame, person by person (default: %(default)s)",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Lift the bag, write the files, print the table.
+
+    Raises:
+        BagError: the bag is damaged (after all was written), or nobody could be lifted.
+    """
+    from paul_ros.errors import BagError
+    from paul_ros.offline.replay import Topics, evaluate, replay
+    from paul_ros.offline.report import table, write_picture
+    from paul_ros.stream.stream import open_stream
+
+    check_files([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
+    topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
+    parameters = {name: getattr(args, name) for name in ("output_layout", "person_height", "smoothing")}
+    stream = open_stream(args.model, args.layout, **parameters)
+    with progress("replay") as count:
+        done = replay(args.bag, stream, args.output, topics, lambda: count(1))
+    report = evaluate(done)
+    publish(report, table, args.json, (lambda: write_picture(args.plot, done)) if args.plot else None)
+    if not report["lifted"] and done.why_not:
+        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.why_not)}")
+    if done.damage:
+        raise done.damage

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays of 2D keypoints lifted without ROS messages: the node's confidence threshold, layouts and lifter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+
+from msg_adapters import Intrinsics
+from msg_adapters.keypoints import Keypoints2D, record
+from paul_ros.errors import LayoutError, PaulError
+from paul_ros.layout import Layout, layout_names, load_layout
+from paul_ros.lifter import Lifted, Lifter
+from paul_ros.stream.route import MODEL, PREFERRED, Route
+
+_NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
+
+
+class KeypointFileError(PaulError, ValueError):
+    """A file of 2D keypoints cannot be used."""
+
+
+@dataclass(frozen=True)
+class Persons:
+    """2D keypoints of N persons, in any images.
+
+    Attributes:
+        frame: (N,) int, the image of each person.
+        person: N ids as text.
+        xy: (N,P,2) pixels; NaN where hidden.
+        confidence: (N,P) in 0..1; 1 where the source has none.
+        visible: (N,P) bool.
+    """
+
+    frame: np.ndarray
+    person: tuple[str, ...]
+    xy: np.ndarray
+    confidence: np.ndarray
+    visible: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        frame: np.ndarray,
+        person: tuple[str, ...],
+        xy: np.ndarray,
+        confidence: np.ndarray | None = None,
+        visible: np.ndarray | None = None,
+    ) -> Persons:
+        """Hide what no camera can have seen, by the rules for messages.
+
+        Args:
+            frame: (N,) int.
+            person: N ids.
+            xy: (N,P,2) pixels, of any real type.
+            confidence: (N,P), or None if the source has none.
+            visible: (N,P) bool, or None if hidden points are NaN.
+        """
+        read = record(xy, confidence, person, _NO_HEADER, visible)
+        return cls(frame, person, read.xy, read.confidence, read.visible)
+
+    @classmethod
+    def stacked(cls, frame: list[int], person: list[str], keypoints: list[np.ndarray]) -> Persons:
+        """Stack N persons' x, y, confidence, arrays (P,3); NaN where hidden."""
+        every = np.stack(keypoints)
+        return cls.of(np.array(frame), tuple(person), every[..., :2], every[..., 2])
+
+
+def layout_of(points: int, model: Layout) -> Layout:
+    """Return the layout that the node would take for this number of keypoints, if nobody names one.
+
+    It is the model's own, or else the first shipped layout that maps onto the model, in the order of PREFERRED.
+
+    Raises:
+        LayoutError: no layout fits.
+    """
+    shipped = (load_layout(name) for name in dict.fromkeys([*PREFERRED, *layout_names()]))
+    for layout in (model, *shipped):
+        if len(layout.names) == points and _maps(layout, model):
+            return layout
+    raise LayoutError(f"no shipped layout of {points} keypoints fits model layout '{model.name}': set --layout")
+
+
+def route_of(given: Layout, model: Layout, output: str | None) -> Route:
+    """Return the mappings from the input's layout to the model's and on to the output's.
+
+    Args:
+        given: layout of the input.
+        model: layout of the model.
+        output: name or path of the output's layout, `model`, or None for the node's default.
+
+    Raises:
+        LayoutError: the layouts have too few points in common.
+    """
+    if not output:
+        return Route.between(given, model)
+    return Route.between(given, model, model if output == MODEL else load_layout(output))
+
+
+def lift_persons(
+    batches: Iterable[Persons], lifter: Lifter, route: Route, camera: Intrinsics | None, min_confidence: float
+) -> Iterator[tuple[Persons, Lifted]]:
+    """Lift batches of persons, one batch at a time.
+
+    Args:
+        batches: persons in the layout `route.given`.
+        lifter: lifts in the model's layout.
+        route: layouts of input and output.
+        camera: intrinsics of the rectified image; None gives model units.
+        min_confidence: keypoints below it count as hidden.
+
+    Yields:
+        Each batch with its persons in 3D, points in the layout `route.output`.
+    """
+    for batch in batches:
+        keypoints = Keypoints2D(batch.xy, batch.confidence, batch.visible, batch.person, 0, "")
+        seen = route.keypoints_in(keypoints, min_confidence)
+        yield batch, route.lifted_out(lifter.lift(seen.xy, seen.visible, camera))
+
+
+def _maps(layout: Layout, model: Layout) -> bool:
+    try:
+        layout.map_to(model)
+    except LayoutError:
+        return False
+    return True
