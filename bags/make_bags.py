@@ -22,7 +22,8 @@ sys.path.insert(0, str(HERE.parent))  # run from a checkout that nobody installe
 
 from msg_adapters.outputs import keypoints_cloud, pose_array  # noqa: E402
 from paul_ros.layout import load_layout  # noqa: E402
-from paul_ros.offline.bag import BagMessages, BagWriter  # noqa: E402
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from training.people.mocap import layout_points  # noqa: E402
 
 RATE = 30  # Hz

@@ -57,8 +57,11 @@ from paul_ros.files import write_atomically
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
 from paul_ros.model import load_model, weight_shapes
-from paul_ros.offline.bag import BagMessages, BagWriter, read_records
-from paul_ros.offline.replay import Topics, evaluate, replay
+from paul_ros.offline.bag_reader import read_records
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.offline.judge import evaluate
+from paul_ros.offline.replay import Topics, replay
 from paul_ros.stream.stream import PACKED, LiftStream
 
 SESSION = 25  # cases

@@ -20,7 +20,7 @@ from paul_ros import metrics
 from paul_ros.files import write_atomically
 from paul_ros.layout import load_layout
 from paul_ros.model import load_model
-from paul_ros.offline.bag import read_messages
+from paul_ros.offline.bag_reader import read_messages
 from paul_ros.onp import OnP, onp
 from paul_ros.pinhole_pose import refine
 from paul_ros.placement import centred_view, place

@@ -43,8 +43,8 @@ class BagError(PaulError):
         self.messages_read = messages_read
 
 
-class WriteError(BagError):
-    """A bag cannot be written to its end."""
+class OutputError(PaulError):
+    """An output file cannot be written, or would overwrite an input."""
 
 
 class WrongTopicError(BagError):

@@ -11,8 +11,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from paul_ros.errors import BagError
-from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
+from paul_ros.errors import BagError, OutputError
+from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 
 POSES = "geometry_msgs/msg/PoseArray"
 TICK = 33_333_333
@@ -223,7 +225,7 @@ def test_failure_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_a_full_disk_leaves_nothing(tmp_path):
     (tmp_path / "a.mcap.part").symlink_to("/dev/full")
-    with pytest.raises(BagError, match="cannot write .*a.mcap: No space left"):
+    with pytest.raises(OutputError, match="cannot write .*a.mcap: No space left"):
         write(tmp_path / "a.mcap")
     assert not list(tmp_path.iterdir())
 
@@ -231,7 +233,7 @@ def test_a_full_disk_leaves_nothing(tmp_path):
 @pytest.mark.parametrize("path, clue", [("", "it is a folder"), ("file/a.mcap", "cannot write .*file/a.mcap: ")])
 def test_where_nothing_can_be_written(tmp_path, path, clue):
     (tmp_path / "file").touch()
-    with pytest.raises(BagError, match=clue):
+    with pytest.raises(OutputError, match=clue):
         write(tmp_path / path)
     assert [file.name for file in tmp_path.iterdir()] == ["file"]
 

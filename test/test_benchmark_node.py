@@ -21,7 +21,7 @@ from paul_ros.benchmarks.node import Turn, clouds, cpu_seconds, memory_growth, r
 from paul_ros.benchmarks.node_report import table
 from paul_ros.benchmarks.traffic import NODES
 from paul_ros.errors import BagError
-from paul_ros.offline.bag import _jazzy
+from paul_ros.offline.bag_records import jazzy_typestore
 
 KEYS = {
     "node",
@@ -117,7 +117,7 @@ def test_odd_settings_are_refused(words, capsys):
 def test_clouds_are_what_the_adapter_reads():
     sent = clouds(3)
     assert sent.shape[0] == 60
-    read = msg_adapters.read(CLOUD, _jazzy().deserialize_cdr(sent[7].tobytes(), CLOUD), 17)
+    read = msg_adapters.read(CLOUD, jazzy_typestore().deserialize_cdr(sent[7].tobytes(), CLOUD), 17)
     assert read.persons == 3 and read.visible.all() and read.ids == ("0", "1", "2")
     assert read.stamp == 0 and read.frame_id == "camera_color_optical_frame"
 

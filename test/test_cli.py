@@ -15,7 +15,7 @@ from conftest import header_of, persons_at, seen
 
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros import __version__, cli
-from paul_ros.offline.bag import BagWriter
+from paul_ros.offline.bag_writer import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
 ONE = ROOT / "bags" / "one_person.mcap"

@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 from paul_ros.errors import BagError, DemoError
-from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
-from paul_ros.offline.demo import BAGS, compare, find_bag, run_live
+from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.offline.demo import BAGS, compare
+from paul_ros.offline.demo_live import run_live
 from paul_ros.offline.replay import replay
+from paul_ros.offline.shipped_bags import find_bag
 from paul_ros.stream.stream import open_stream
 
 

@@ -17,7 +17,9 @@ from paul_ros.errors import BagError
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
 from paul_ros.model import load_model
-from paul_ros.offline.bag import BagMessages, BagWriter, matches, read_records
+from paul_ros.offline.bag_reader import matches, read_records
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.replay import Topics, replay
 from paul_ros.stream.stream import LiftStream, open_stream
 

@@ -20,7 +20,8 @@ import msg_adapters
 from msg_adapters import Adapter, Keypoints2D, MessageError, WrongPointCount, plugins, record
 from paul_ros.lifter import Lifter
 from paul_ros.model import load_model
-from paul_ros.offline.bag import BagMessages, BagWriter
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.stream.stream import LiftStream
 
 PEOPLE = "acme_msgs/msg/People"

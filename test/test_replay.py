@@ -12,12 +12,17 @@ import numpy as np
 import pytest
 
 from paul_ros import metrics
-from paul_ros.errors import BagError, PictureError
+from paul_ros.errors import BagError, OutputError, PictureError
+from paul_ros.files import write_json
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
-from paul_ros.offline.replay import Topics, evaluate, flips, replay
-from paul_ros.offline.report import table, write_json, write_picture
+from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.offline.judge import count_flips, evaluate
+from paul_ros.offline.picture import write_picture
+from paul_ros.offline.replay import Topics, replay
+from paul_ros.offline.report import table
 from paul_ros.stream.stream import open_stream
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -326,7 +331,7 @@ def test_topic_of_the_wrong_type(short, model_file, tmp_path, topics, clue):
 def test_output_that_cannot_be_written_is_told_before_anything_is_lifted(short, model_file, tmp_path):
     for output, clue in (tmp_path, "it is a folder"), (Path("/proc/x.mcap"), "cannot write /proc/x.mcap"):
         lifted = []
-        with pytest.raises(BagError, match=clue):
+        with pytest.raises(OutputError, match=clue):
             replay(short, open_stream(model_file), output, on_frame=lambda: lifted.append(1))
         assert not lifted
     assert not list(tmp_path.parent.glob(f"{tmp_path.name}*.part"))
@@ -334,7 +339,7 @@ def test_output_that_cannot_be_written_is_told_before_anything_is_lifted(short, 
 
 def test_output_over_the_input_is_refused(short, model_file):
     before = short.read_bytes()
-    with pytest.raises(BagError, match="name another output"):
+    with pytest.raises(OutputError, match="name another output"):
         replay(short, open_stream(model_file), short)
     assert short.read_bytes() == before
 
@@ -430,13 +435,13 @@ def test_the_distance_is_as_wrong_as_it_says(short, model_file):
 def test_flips_are_counted(model_file):
     """Persons mirrored in depth, or turned about, in single frames; not those that move in the image as well."""
     done = replay(TWO, open_stream(model_file))
-    clean = flips(done.frames)
+    clean = count_flips(done.frames)
     for frame in done.frames[100:200:10]:
         ray = frame.lifted.root / np.linalg.norm(frame.lifted.root, axis=1, keepdims=True)
         depth = ((frame.lifted.points - frame.lifted.root[:, None]) * ray[:, None]).sum(2, keepdims=True)
         frame.lifted.points[:] -= 2 * depth * ray[:, None]
     lifted = sum(frame.lifted.ok.sum() for frame in done.frames[100:200:10])
-    counted = flips(done.frames)
+    counted = count_flips(done.frames)
     assert counted["pairs_of_frames"] == clean["pairs_of_frames"] > 500
     new = (counted["flips_per_1000_frames"] - clean["flips_per_1000_frames"]) * counted["pairs_of_frames"] / 1000
     # There and back, but for persons that are about flat to the camera: their mirror image is hardly another.
@@ -447,7 +452,7 @@ def test_who_has_no_id_has_no_flips(short, model_file):
     done = replay(short, open_stream(model_file))
     for frame in done.frames:
         object.__setattr__(frame.keypoints, "ids", ("",) * len(frame.keypoints.ids))
-    assert flips(done.frames) == {"pairs_of_frames": 0, "flips_per_1000_frames": None}
+    assert count_flips(done.frames) == {"pairs_of_frames": 0, "flips_per_1000_frames": None}
 
 
 def test_the_filter_works_in_replay_as_in_the_stream(short, model_file, tmp_path):

@@ -18,7 +18,9 @@ from msg_adapters.outputs import keypoints_cloud
 from paul_ros.errors import BagError, ModelError
 from paul_ros.layout import load_layout
 from paul_ros.model import load_model
-from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records
+from paul_ros.offline.bag_reader import read_messages, read_records
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import open_stream
 from training import command as cli

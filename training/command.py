@@ -20,7 +20,7 @@ from tqdm import tqdm
 from paul_ros.files import write_atomically
 from paul_ros.layout import Layout, load_layout
 from paul_ros.model import check_size
-from paul_ros.offline.bag import check_outputs
+from paul_ros.output_files import check_outputs
 from paul_ros.stream.parameters import DEFAULTS
 from training.categories import load_files
 from training.data import TrainingData, check_sizes

@@ -27,10 +27,11 @@ import numpy as np
 from msg_adapters import outputs, read
 from paul_ros.benchmarks.traffic import ARRIVAL, NODES
 from paul_ros.errors import NodeBenchmarkError
-from paul_ros.offline.bag import BagMessages, read_records
-from paul_ros.offline.demo import find_bag
+from paul_ros.offline.bag_reader import read_records
+from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.processes import need_ros, process, ros_environment, rss_mb, tail
-from paul_ros.offline.replay import versions
+from paul_ros.offline.shipped_bags import find_bag
+from paul_ros.versions import versions
 
 STARTS = 3
 """Of each node, for the time from its start to its first output."""

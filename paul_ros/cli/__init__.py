@@ -96,9 +96,12 @@ def _add_replay(commands: argparse._SubParsersAction) -> None:
 
 def _replay(args: argparse.Namespace) -> None:
     from paul_ros.errors import BagError
-    from paul_ros.offline.bag import check_outputs
-    from paul_ros.offline.replay import Topics, evaluate, replay
-    from paul_ros.offline.report import table, write_json, write_picture
+    from paul_ros.files import write_json
+    from paul_ros.offline.judge import evaluate
+    from paul_ros.offline.picture import write_picture
+    from paul_ros.offline.replay import Topics, replay
+    from paul_ros.offline.report import table
+    from paul_ros.output_files import check_outputs
     from paul_ros.stream.stream import open_stream
 
     check_outputs([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
@@ -115,8 +118,8 @@ def _replay(args: argparse.Namespace) -> None:
             write_picture(args.plot, done)
     finally:
         print(table(report))  # after the files, for who reads it may stop reading
-    if not report["lifted"] and done.why_not:
-        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.why_not)}")
+    if not report["lifted"] and done.drop_advice:
+        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.drop_advice)}")
     if done.damage:
         raise done.damage
 
@@ -175,9 +178,10 @@ def _seconds(text: str) -> float:
 
 def _view(args: argparse.Namespace) -> None:
     from paul_ros.model import load_model
-    from paul_ros.offline.bag import check_outputs
-    from paul_ros.offline.film import view_bag, view_model
+    from paul_ros.offline.film import view_bag
+    from paul_ros.offline.film_model import view_model
     from paul_ros.offline.replay import Topics
+    from paul_ros.output_files import check_outputs
     from paul_ros.stream.stream import open_stream
 
     thing, damage = Path(args.thing), None
@@ -189,7 +193,7 @@ def _view(args: argparse.Namespace) -> None:
         film, damage = view_bag(thing, stream, output, topics, args.start, args.seconds, _ticked)
     else:
         film = view_model(load_model(args.thing), output, _ticked)
-    print(f"{film.path}: {film.said}")
+    print(f"{film.path}: {film.summary}")
     if damage:
         raise damage
 
@@ -217,9 +221,9 @@ def _add_inspect(commands: argparse._SubParsersAction) -> None:
 
 
 def _inspect(args: argparse.Namespace) -> None:
-    from paul_ros.offline.bag import check_outputs
+    from paul_ros.files import write_json
     from paul_ros.offline.inspection import as_text, inspect
-    from paul_ros.offline.report import write_json
+    from paul_ros.output_files import check_outputs
 
     check_outputs([args.json], [args.thing])
     summary, damage = inspect(args.thing)
@@ -325,8 +329,8 @@ def _natural(text: str) -> int:
 
 def _benchmark_onp(args: argparse.Namespace) -> None:
     from paul_ros.benchmarks import need
-    from paul_ros.offline.bag import check_outputs
-    from paul_ros.offline.report import write_json
+    from paul_ros.files import write_json
+    from paul_ros.output_files import check_outputs
 
     need("scipy", "tqdm", *(["matplotlib"] if args.plot else []))
     from paul_ros.benchmarks.onp import run
@@ -417,8 +421,8 @@ def _share(text: str) -> float:
 
 def _benchmark_nrsfm(args: argparse.Namespace) -> None:
     from paul_ros.benchmarks import need
-    from paul_ros.offline.bag import check_outputs
-    from paul_ros.offline.report import write_json
+    from paul_ros.files import write_json
+    from paul_ros.output_files import check_outputs
 
     check_outputs([args.json, args.plot], args.data.glob("*.npz"))
     need("tqdm", *(["matplotlib"] if args.plot else []))
@@ -512,8 +516,8 @@ def _minutes(text: str) -> float:
 
 def _benchmark_node(args: argparse.Namespace) -> None:
     from paul_ros.benchmarks import need
-    from paul_ros.offline.bag import check_outputs
-    from paul_ros.offline.report import write_json
+    from paul_ros.files import write_json
+    from paul_ros.output_files import check_outputs
 
     need("tqdm", *(["matplotlib"] if args.plot else []))
     from paul_ros.benchmarks.node import run, soak
@@ -601,7 +605,7 @@ def _two_frames(text: str) -> tuple[int, int]:
 
 def _study(args: argparse.Namespace) -> None:
     from paul_ros.benchmarks import need
-    from paul_ros.offline.bag import check_outputs
+    from paul_ros.output_files import check_outputs
 
     check_outputs([args.output / f"{args.study}.{kind}" for kind in ("json", "png")], args.data)
     need("tqdm", "matplotlib")
@@ -616,7 +620,7 @@ def _study(args: argparse.Namespace) -> None:
 
 
 def _interpolation(args: argparse.Namespace) -> None:
-    from paul_ros.offline.bag import check_outputs
+    from paul_ros.output_files import check_outputs
     from training.judge.studies import interpolation
 
     check_outputs([args.output / f"interpolation.{kind}" for kind in ("json", "png")], [args.model, *args.data])
@@ -662,8 +666,8 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
 
 def _evaluate(args: argparse.Namespace) -> None:
     from paul_ros.benchmarks import need
-    from paul_ros.offline.bag import check_outputs
-    from paul_ros.offline.report import write_json
+    from paul_ros.files import write_json
+    from paul_ros.output_files import check_outputs
 
     if (args.data is None) == (args.truth is None):
         args.usage_error("name DATA for a model, or --truth DATA for saved shapes")

@@ -18,8 +18,8 @@ from paul_ros.errors import ModelError, NpzError
 from paul_ros.files import read_npz
 from paul_ros.lifter import AMBIGUOUS, DEGENERATE_POINTS, TOO_FEW_POINTS
 from paul_ros.model import Model, load_model
-from paul_ros.offline.replay import versions
 from paul_ros.onp import onp
+from paul_ros.versions import versions
 from training.categories import among_categories
 from training.errors import DataError
 from training.judge.truth import Sequence, load_sequence

@@ -28,7 +28,7 @@ from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import BagError, NpzError
 from paul_ros.files import read_npz, write_atomically
 from paul_ros.model import enough_visible
-from paul_ros.offline.bag import check_outputs
+from paul_ros.output_files import check_outputs
 from paul_ros.placement import centred_view
 from training.errors import MocapError, RecipeError
 from training.people.asf_amc import Skeleton, read_amc, read_asf

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from paul_ros.files import write_json
 from paul_ros.model import Model, load_model, normalise
-from paul_ros.offline.replay import versions
-from paul_ros.offline.report import write_json
 from paul_ros.onp import onp
+from paul_ros.versions import versions
 from training.categories import among_categories
 from training.data import load_training_data
 from training.errors import DataError
