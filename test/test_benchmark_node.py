@@ -16,8 +16,10 @@ from conftest import ROOT
 
 import msg_adapters
 from paul_ros import cli
-from paul_ros.benchmarks import node
-from paul_ros.benchmarks.node import Turn, clouds, cpu_seconds, memory_growth, ratios, row, spread
+from paul_ros.benchmarks import node, node_messages, node_processes
+from paul_ros.benchmarks.node import memory_growth, ratios, row
+from paul_ros.benchmarks.node_messages import clouds, spread
+from paul_ros.benchmarks.node_processes import Turn, cpu_seconds
 from paul_ros.benchmarks.node_report import table
 from paul_ros.benchmarks.traffic import NODES
 from paul_ros.errors import BagError
@@ -81,7 +83,7 @@ def test_a_short_soak(monkeypatch, tmp_path, capsys):
 
 
 def test_a_node_that_cannot_start_is_told(monkeypatch, capsys):
-    monkeypatch.setitem(node._MODULES, "lifter", "paul_ros.benchmarks.none_such")
+    monkeypatch.setitem(node_processes.MODULES, "lifter", "paul_ros.benchmarks.none_such")
     before = children()
     assert cli.main(["benchmark", "node"]) == 1
     assert children() == before
@@ -100,7 +102,7 @@ def test_without_the_recording_it_is_said_what_to_do(monkeypatch, capsys):
     def missing(name):
         raise BagError(f"the recording '{name}' is not installed")
 
-    monkeypatch.setattr(node, "find_bag", missing)
+    monkeypatch.setattr(node_messages, "find_bag", missing)
     assert cli.main(["benchmark", "node"]) == 1
     assert "is not installed" in capsys.readouterr().err
 

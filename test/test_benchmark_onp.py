@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from paul_ros import cli
 from paul_ros.benchmarks import naive, onp, rivals
-from paul_ros.benchmarks.onp import Scenario, judge_scenario, problems
+from paul_ros.benchmarks.onp import judge_scenario
+from paul_ros.benchmarks.onp_problems import Scenario, problems
 from paul_ros.benchmarks.onp_report import table
 
 SCALES = ("free", "unit")
@@ -213,9 +214,7 @@ def test_a_missing_package_is_one_line(module, monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(["benchmark", "onp", "--cases", "5", "--plot", str(tmp_path / "p.png")]) == 1
     printed = capsys.readouterr()
-    assert printed.err == (
-        f"paul: the benchmark needs the Python package '{module}': pip install 'paul_ros[benchmark]'\n"
-    )
+    assert printed.err == (f"paul: the Python package '{module}' is missing: pip install 'paul_ros[benchmark]'\n")
 
 
 @pytest.mark.parametrize("words", [["--cases", "0"], ["--batch", "-3"], ["--cases", "many"]])

@@ -328,11 +328,11 @@ def _natural(text: str) -> int:
 
 
 def _benchmark_onp(args: argparse.Namespace) -> None:
-    from paul_ros.benchmarks import need
+    from paul_ros.extras import require
     from paul_ros.files import write_json
     from paul_ros.output_files import check_outputs
 
-    need("scipy", "tqdm", *(["matplotlib"] if args.plot else []))
+    require("benchmark", "scipy", "tqdm", *(["matplotlib"] if args.plot else []))
     from paul_ros.benchmarks.onp import run
     from paul_ros.benchmarks.onp_report import table, write_picture
 
@@ -420,12 +420,12 @@ def _share(text: str) -> float:
 
 
 def _benchmark_nrsfm(args: argparse.Namespace) -> None:
-    from paul_ros.benchmarks import need
+    from paul_ros.extras import require
     from paul_ros.files import write_json
     from paul_ros.output_files import check_outputs
 
     check_outputs([args.json, args.plot], args.data.glob("*.npz"))
-    need("tqdm", *(["matplotlib"] if args.plot else []))
+    require("benchmark", "tqdm", *(["matplotlib"] if args.plot else []))
     with _training_packages():
         from training.judge import nrsfm as benchmark
     report = benchmark.run(
@@ -515,11 +515,11 @@ def _minutes(text: str) -> float:
 
 
 def _benchmark_node(args: argparse.Namespace) -> None:
-    from paul_ros.benchmarks import need
+    from paul_ros.extras import require
     from paul_ros.files import write_json
     from paul_ros.output_files import check_outputs
 
-    need("tqdm", *(["matplotlib"] if args.plot else []))
+    require("benchmark", "tqdm", *(["matplotlib"] if args.plot else []))
     from paul_ros.benchmarks.node import run, soak
     from paul_ros.benchmarks.node_report import table, write_picture
 
@@ -604,11 +604,11 @@ def _two_frames(text: str) -> tuple[int, int]:
 
 
 def _study(args: argparse.Namespace) -> None:
-    from paul_ros.benchmarks import need
+    from paul_ros.extras import require
     from paul_ros.output_files import check_outputs
 
     check_outputs([args.output / f"{args.study}.{kind}" for kind in ("json", "png")], args.data)
-    need("tqdm", "matplotlib")
+    require("benchmark", "tqdm", "matplotlib")
     with _training_packages():
         from training.judge.studies import study
     keeping = _keeping(args, args.output / "work")
@@ -665,7 +665,7 @@ def _add_evaluate(commands: argparse._SubParsersAction) -> None:
 
 
 def _evaluate(args: argparse.Namespace) -> None:
-    from paul_ros.benchmarks import need
+    from paul_ros.extras import require
     from paul_ros.files import write_json
     from paul_ros.output_files import check_outputs
 
@@ -673,7 +673,7 @@ def _evaluate(args: argparse.Namespace) -> None:
         args.usage_error("name DATA for a model, or --truth DATA for saved shapes")
     check_outputs([args.json, args.plot], [args.model, args.data, args.truth])
     if args.plot:
-        need("matplotlib")
+        require("benchmark", "matplotlib")
     with _training_packages():
         from training.judge import evaluation
     if args.truth:

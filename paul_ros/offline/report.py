@@ -27,17 +27,16 @@ def table(report: dict) -> str:
     if report["persons_with_truth"]:
         lines += ["", f"  {_who_is_judged(report)}", f"  {'':<22}{'lifted':>9}{'rigid':>9}"]
         lines += [
-            f"  {name:<22}{_cell(report[key])}{_cell(report['baseline'][key])}  {unit}"
-            for name, key, unit in _ERROR_ROWS
+            f"  {name:<22}{cell(report[key])}{cell(report['baseline'][key])}  {unit}" for name, key, unit in _ERROR_ROWS
         ]
     lines += [
         "",
-        f"  {'reprojection, median':<22}{_cell(report['reprojection_median_px'])}{'':>9}  px",
-        f"  {'proven optimal':<22}{_cell(report['certified_share'], 100)}{'':>9}  %",
-        f"  {'mirror ambiguous':<22}{_cell(report['ambiguous_share'], 100)}{'':>9}  %",
-        f"  {'flips in depth':<22}{_cell(report['flips_per_1000_frames'])}{'':>9}  per 1000 pairs of frames",
-        f"  {'lift, median':<22}{_cell(report['lift_us_median'])}{'':>9}  µs a frame "
-        f"(99 %: {_cell(report['lift_us_p99']).strip()})",
+        f"  {'reprojection, median':<22}{cell(report['reprojection_median_px'])}{'':>9}  px",
+        f"  {'proven optimal':<22}{cell(_percent(report['certified_share']))}{'':>9}  %",
+        f"  {'mirror ambiguous':<22}{cell(_percent(report['ambiguous_share']))}{'':>9}  %",
+        f"  {'flips in depth':<22}{cell(report['flips_per_1000_frames'])}{'':>9}  per 1000 pairs of frames",
+        f"  {'lift, median':<22}{cell(report['lift_us_median'])}{'':>9}  µs a frame "
+        f"(99 %: {cell(report['lift_us_p99']).strip()})",
     ]
     return "\n".join(lines)
 
@@ -48,5 +47,10 @@ def _who_is_judged(report: dict) -> str:
     return f"errors of {judged} of {persons} persons, {100 * (1 - judged / persons):.1f} % left out{points}"
 
 
-def _cell(value: float | None, factor: float = 1.0) -> str:
-    return f"{'-':>9}" if value is None else f"{factor * value:>9.1f}"
+def cell(value: float | None, width: int = 9, digits: int = 1) -> str:
+    """Return a number as a table's cell, aligned right; '-' for None."""
+    return f"{'-':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
