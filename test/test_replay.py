@@ -437,15 +437,44 @@ def test_flips_are_counted(model_file):
     done = replay(TWO, open_stream(model_file))
     clean = count_flips(done.frames)
     for frame in done.frames[100:200:10]:
-        ray = frame.lifted.root / np.linalg.norm(frame.lifted.root, axis=1, keepdims=True)
-        depth = ((frame.lifted.points - frame.lifted.root[:, None]) * ray[:, None]).sum(2, keepdims=True)
-        frame.lifted.points[:] -= 2 * depth * ray[:, None]
+        frame.lifted.points[:] = mirrored_in_depth(frame.lifted)
     lifted = sum(frame.lifted.ok.sum() for frame in done.frames[100:200:10])
     counted = count_flips(done.frames)
     assert counted["pairs_of_frames"] == clean["pairs_of_frames"] > 500
     new = (counted["flips_per_1000_frames"] - clean["flips_per_1000_frames"]) * counted["pairs_of_frames"] / 1000
     # There and back, but for persons that are about flat to the camera: their mirror image is hardly another.
     assert lifted < new <= 2 * lifted
+
+
+def mirrored_in_depth(lifted):
+    """Points across the plane through the root that faces the camera."""
+    ray = lifted.root / np.linalg.norm(lifted.root, axis=1, keepdims=True)
+    depth = ((lifted.points - lifted.root[:, None]) * ray[:, None]).sum(2, keepdims=True)
+    return lifted.points - 2 * depth * ray[:, None]
+
+
+@pytest.fixture(scope="module")
+def deepest(tmp_path_factory):
+    """The frame whose person differs most from its mirror image."""
+    bag = part_of(ONE, tmp_path_factory.mktemp("bags") / "one.mcap", 4)
+    return max(
+        replay(bag, open_stream()).frames,
+        key=lambda frame: np.abs(mirrored_in_depth(frame.lifted) - frame.lifted.points).max(),
+    )
+
+
+@pytest.mark.parametrize(
+    "growth, shift, flips",
+    [(0.0, 0.0, 1), (0.29, 0.0, 1), (0.31, 0.0, 0), (-0.31, 0.0, 0), (0.0, 500.0, 1)],
+    ids=["still", "moves a little", "grows", "shrinks", "walks by"],
+)
+def test_a_flip_needs_an_image_that_stays(deepest, growth, shift, flips):
+    """A person that moves in the image by 30 % of its size may have turned; a shift of the whole person is no such."""
+    lifted = replace(deepest.lifted, points=mirrored_in_depth(deepest.lifted))
+    middle = deepest.given.xy[deepest.given.visible].mean(0)
+    given = replace(deepest.given, xy=deepest.given.xy + growth * (deepest.given.xy - middle) + shift)
+    counted = count_flips([deepest, replace(deepest, lifted=lifted, given=given)])
+    assert counted == {"pairs_of_frames": 1, "flips_per_1000_frames": 1000 * flips}
 
 
 def test_who_has_no_id_has_no_flips(short, model_file):

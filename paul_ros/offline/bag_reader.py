@@ -13,16 +13,13 @@ import zlib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
 from paul_ros.errors import BagError
 from paul_ros.extras import require
 from paul_ros.offline.bag_records import Record
-
-if TYPE_CHECKING:
-    from mcap.records import Channel, Footer, Message, Schema
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _CHECKSUM_BYTES = 4
@@ -150,8 +147,8 @@ def _check_start(stream: io.BufferedReader, file: Path) -> int:
     return size
 
 
-def _messages(stream: io.BufferedReader, size: int) -> Iterator[tuple[Message, Channel, Schema]]:
-    """Read the messages of an mcap file, each with its channel and schema, and check every checksum of the file.
+def _messages(stream: io.BufferedReader, size: int) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield the messages of an mcap file with their channels and schemas, and check every checksum of the file.
 
     The mcap library checks the chunks, the data section and the end mark. It ignores the summary's checksum, a missing
     end of the data section, and bytes after the end mark; these are checked here.
@@ -174,12 +171,12 @@ def _messages(stream: io.BufferedReader, size: int) -> Iterator[tuple[Message, C
         elif isinstance(record, DataEnd):
             summary_start = stream.tell()
         elif isinstance(record, Footer):
-            _check_summary(stream, summary_start, record)
+            _check_summary(stream, summary_start, record.summary_crc)
     if stream.tell() != size:
         raise ValueError("the file goes on after the end mark")
 
 
-def _check_summary(stream: io.BufferedReader, start: int | None, footer: Footer) -> None:
+def _check_summary(stream: io.BufferedReader, start: int | None, checksum: int) -> None:
     """Check the checksum of the summary; the file stays behind the footer.
 
     mcap specification, "Footer": it covers the summary and the footer up to the checksum itself; 0 = not computed.
@@ -190,5 +187,5 @@ def _check_summary(stream: io.BufferedReader, start: int | None, footer: Footer)
     stream.seek(start)
     covered = stream.read(footer_end - _CHECKSUM_BYTES - start)
     stream.seek(footer_end)
-    if footer.summary_crc not in (0, zlib.crc32(covered)):
+    if checksum not in (0, zlib.crc32(covered)):
         raise ValueError("the checksum of the summary is wrong")
