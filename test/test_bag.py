@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -129,6 +130,41 @@ def test_any_changed_byte_is_noticed(bag, tmp_path):
         assert [time for *_, time in found] == expected[: len(found)]
 
 
+@pytest.fixture
+def unchunked(tmp_path):
+    """A bag without chunks and checksums, as a fast recorder writes it: 20 messages."""
+    make, path = BagMessages(), tmp_path / "unchunked.mcap"
+    with open(path, "wb") as file:
+        writer = McapWriter(file, use_chunking=False, enable_crcs=False)
+        writer.start("ros2", "a fast recorder")
+        schema = writer.register_schema(POSES, "ros2msg", make.definition(POSES).encode())
+        channel = writer.register_channel("/poses", "cdr", schema)
+        for number in range(20):
+            writer.add_message(channel, number, make.serialise(poses(make, number)), number)
+        writer.finish()
+    return path
+
+
+def test_a_message_that_the_end_cuts_is_not_read(unchunked):
+    """The mcap library alone would yield half a message."""
+    assert len(list(read_records(unchunked))) == 20
+    whole, counts = unchunked.read_bytes(), []
+    for size in range(3000, 8000, 97):
+        unchunked.write_bytes(whole[:size])
+        found, error = read_until_damage(unchunked)
+        assert error is not None and "ends too early" in str(error) and error.messages_read == len(found)
+        assert all(len(message.poses) == 40 for _, message, _ in found)
+        counts.append(len(found))
+    assert len(set(counts)) > 2
+
+
+def test_bytes_after_the_end_are_noticed(unchunked):
+    with open(unchunked, "ab") as file:
+        file.write(b"x")
+    found, error = read_until_damage(unchunked)
+    assert len(found) == 20 and "goes on after the end mark" in str(error)
+
+
 @pytest.mark.parametrize(
     "content, clue",
     [
@@ -138,7 +174,7 @@ def test_any_changed_byte_is_noticed(bag, tmp_path):
         (b"\x89MC", "not an mcap file"),
     ],
 )
-def test_what_is_no_bag(tmp_path, content, clue):
+def test_other_files_are_refused(tmp_path, content, clue):
     path = tmp_path / "odd.mcap"
     path.write_bytes(content)
     found, error = read_until_damage(path)

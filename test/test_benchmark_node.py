@@ -82,7 +82,7 @@ def test_a_short_soak(monkeypatch, tmp_path, capsys):
     assert "MB an hour" in capsys.readouterr().out and files[1].read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_node_that_cannot_start_is_told(monkeypatch, capsys):
+def test_a_node_that_cannot_start_is_reported(monkeypatch, capsys):
     monkeypatch.setitem(node_processes.MODULES, "lifter", "paul_ros.benchmarks.none_such")
     before = children()
     assert cli.main(["benchmark", "node"]) == 1
@@ -91,14 +91,14 @@ def test_a_node_that_cannot_start_is_told(monkeypatch, capsys):
     assert told.startswith("paul: the lifter ended by itself (1)") and "none_such" in told
 
 
-def test_without_ros_it_is_said_what_to_install(monkeypatch, capsys):
+def test_without_ros_the_error_names_the_cure(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert cli.main(["benchmark", "node"]) == 1
     told = capsys.readouterr().err.splitlines()[-1]
     assert "the benchmark needs ROS 2" in told and "paul_ros[ros]" in told
 
 
-def test_without_the_recording_it_is_said_what_to_do(monkeypatch, capsys):
+def test_without_the_recording_the_error_names_the_cure(monkeypatch, capsys):
     def missing(name):
         raise BagError(f"the recording '{name}' is not installed")
 

@@ -100,7 +100,7 @@ def test_polar_beats_the_least_squares_it_starts_from():
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("kind", [{"points": 4}, {"thickness": 0.05}, {"thickness": 0.0}, {"hidden": 0.5}])
 def test_the_naive_search_finds_the_optimum(scale, kind):
-    """That BFGS finds, from 20 random rotations and a scale."""
+    """BFGS from 20 random rotations and a scale finds the same."""
     data = given(scale, 4, **kind)
     found = naive.naive_optimum(*data[:3], scale)
     weights = np.ones(data.S[:, 0].shape) if data.weights is None else data.weights
@@ -119,7 +119,7 @@ def test_the_naive_search_finds_the_optimum(scale, kind):
 
 
 def test_the_naive_search_shares_nothing_with_the_solver():
-    """Nor do the rivals: a fault in common would hide itself."""
+    """The rivals do not either: a common fault would stay hidden."""
     for module in (naive, rivals):
         assert not [name for name, value in vars(module).items() if "onp" in str(getattr(value, "__module__", ""))]
         assert "viewing_sphere" not in vars(module) and "paul_ros.onp import" not in Path(module.__file__).read_text()

@@ -21,7 +21,7 @@ from paul_ros.stream.stream import open_stream
 
 @pytest.fixture(scope="module")
 def two_seconds(tmp_path_factory):
-    """Of the crossing, from the first empty frames on until both are seen; without its truth."""
+    """Two seconds of the crossing, from empty frames until both persons are seen; without the ground truth."""
     path = tmp_path_factory.mktemp("demo") / "short.mcap"
     with BagWriter(path) as writer:
         for record in list(read_records(find_bag("two_persons_crossing"), ["/camera_info", "/keypoints"]))[40:160]:

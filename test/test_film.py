@@ -120,7 +120,7 @@ def test_nobody_lifted(tmp_path, model_file):
         film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
 
 
-def test_half_a_bag_is_drawn_and_told(tmp_path, capsys):
+def test_half_a_bag_is_drawn_and_reported(tmp_path, capsys):
     whole = find_bag("one_person").read_bytes()
     bag, out = tmp_path / "half.mcap", tmp_path / "f.png"
     bag.write_bytes(whole[: len(whole) // 8])
@@ -165,7 +165,7 @@ def test_the_turntable():
     np.testing.assert_allclose(turntable(0.3) @ turntable(0.3).T, np.eye(3), atol=1e-12)
     up = turntable(1.0) @ np.array([0, -1.0, 0])
     assert up[1] < -0.9 and abs(up[0]) < 1e-12
-    # Who looks down sees what is farther off higher in the picture.
+    # A viewer who looks down sees farther points higher in the picture.
     assert (turntable(0.0) @ np.array([0, 0, 1.0]))[1] * -1 > 0.1
     # A quarter turn brings the right to where the far side was.
     np.testing.assert_allclose(np.abs((turntable(np.pi / 2) @ np.array([1.0, 0, 0]))[0]), 0, atol=1e-12)

@@ -31,7 +31,7 @@ PIXELS = np.array([seen(persons_at((0.3 + 0.1 * n, 0, 4), (-1, 0.1, 5))) for n i
 
 
 class Factory(BagMessages):
-    """What bags are written with, the foreign packages included."""
+    """Return the factory that bags are written with, foreign packages included."""
 
     def __init__(self) -> None:
         super().__init__(foreign.DEFINITIONS)

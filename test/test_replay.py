@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replay: the same bytes every time, figures that are right, reports that are whole, damage that is told."""
+"""Replay: the same bytes every time, right figures, whole reports, damage that is reported."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_scaled_prediction_shows_in_ne_but_not_in_n_mpjpe(short, model_file):
 
 
 @pytest.mark.parametrize("bag, most_mm", [(ONE, 58), (TWO, 45)], ids=["one", "two"])
-def test_the_shipped_model_keeps_its_word(bag, most_mm):
+def test_the_shipped_model_is_as_good_as_documented(bag, most_mm):
     """The main figures: shape at least halves the error of a rigid model, and left is never taken for right."""
     report = evaluate(replay(bag, open_stream()))
     assert report["persons_with_truth"] == report["lifted"] > 0.9 * report["persons"]
@@ -202,7 +202,7 @@ def root_errors(done, frame):
     return np.linalg.norm(hips[0] - hips[1], axis=1)
 
 
-def test_table_says_whom_the_errors_are_of(short, model_file, partial):
+def test_table_names_the_judged_persons(short, model_file, partial):
     whole, some = (table(evaluate(done)) for done in (replay(short, open_stream(model_file)), partial[0]))
     report = evaluate(partial[0])
     left_out = 100 * (1 - report["lifted"] / report["persons"])
@@ -224,7 +224,7 @@ def test_truth_without_a_point_of_the_root(short, model_file):
 @pytest.mark.parametrize(
     "value, points", [(0.0, 17), (2.5, 17), (np.nan, 17), (np.nan, 14)], ids=["zero", "one place", "none", "three"]
 )
-def test_what_is_no_truth(short, model_file, value, points):
+def test_degenerate_truth_is_ignored(short, model_file, value, points):
     """Points in one place fit any shape scaled to nothing, and three points nearly any."""
     done = replay(short, open_stream(model_file))
     for truth in done.truth.values():
@@ -261,8 +261,8 @@ def test_without_camera_info(short, model_file, tmp_path):
 
 
 @pytest.mark.parametrize("bag", [ONE, TWO])
-def test_a_wrong_layout_is_told(bag, tmp_path):
-    """COCO's points in the order of Human3.6M: as many, so nothing but the shapes tells; right ones are never noted."""
+def test_a_wrong_layout_is_noted(bag, tmp_path):
+    """COCO's points in the order of Human3.6M have the right number, so only their shapes reveal them."""
     part = part_of(bag, tmp_path / "x.mcap", 4)
     right, wrong = (evaluate(replay(part, open_stream(None, layout))) for layout in ("coco17", "h36m17"))
     assert not right["noted"] and "noted" not in table(right)
@@ -387,7 +387,7 @@ def test_picture_without_truth_or_camera(short, model_file, tmp_path, left_out):
     ids=["no hip", "infinite", "one point", "far off", "zero"],
 )
 def test_picture_over_an_odd_truth(model_file, tmp_path, left_out, bag, value, points):
-    """Of the first person of every message; what cannot be drawn is left out."""
+    """The truth of the first person in every message is changed; points that cannot be drawn are left out."""
     with BagWriter(tmp_path / "x.mcap") as writer:
         for topic, _, message, time in list(read_messages(bag))[380:410]:
             if topic == "/ground_truth/poses":
@@ -469,7 +469,7 @@ def deepest(tmp_path_factory):
     ids=["still", "moves a little", "grows", "shrinks", "walks by"],
 )
 def test_a_flip_needs_an_image_that_stays(deepest, growth, shift, flips):
-    """A person that moves in the image by 30 % of its size may have turned; a shift of the whole person is no such."""
+    """A person that moves in the image by 30 % of its size may have turned; a shift of the whole person does not count."""
     lifted = replace(deepest.lifted, points=mirrored_in_depth(deepest.lifted))
     middle = deepest.given.xy[deepest.given.visible].mean(0)
     given = replace(deepest.given, xy=deepest.given.xy + growth * (deepest.given.xy - middle) + shift)
@@ -477,7 +477,7 @@ def test_a_flip_needs_an_image_that_stays(deepest, growth, shift, flips):
     assert counted == {"pairs_of_frames": 1, "flips_per_1000_frames": 1000 * flips}
 
 
-def test_who_has_no_id_has_no_flips(short, model_file):
+def test_persons_without_id_have_no_flips(short, model_file):
     done = replay(short, open_stream(model_file))
     for frame in done.frames:
         object.__setattr__(frame.keypoints, "ids", ("",) * len(frame.keypoints.ids))
@@ -495,7 +495,7 @@ def test_the_filter_works_in_replay_as_in_the_stream(short, model_file, tmp_path
 
 
 def test_bytes_that_are_no_message_are_a_counted_drop(model_file, tmp_path):
-    """They cost themselves, not what comes after them."""
+    """They are lost; the messages after them are not."""
 
     def cut(record):
         return replace(record, data=record.data[:30]) if 0.2e9 < record.log_time % 1e9 < 0.3e9 else record

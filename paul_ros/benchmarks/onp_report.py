@@ -136,7 +136,7 @@ def _draw_times(ax: Any, rows: list[dict]) -> None:
         xlabel="µs a pose: full dots alone, hollow dots in a batch",
         ylabel="residual over that of the optimum",
     )
-    ax.set_title("What the residual costs (a dot a scenario, the median)", loc="left", fontweight="bold")
+    ax.set_title("Time against residual (a dot for each scenario, the median)", loc="left", fontweight="bold")
     ax.axhline(1, color="#dddddd", zorder=0)
 
 

@@ -122,8 +122,8 @@ def polar(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str) 
 
     The viewing direction n is normal to the rows of the affine camera. The best pose that looks along n is the polar
     factor of B (I - n n^T): orthogonal Procrustes (Schoenemann, Psychometrika 1966) in the plane across n. The scale
-    is that of least squares. This is the strongest closed form of its kind we know: the polar factor of the affine
-    camera is `lsq_svd`, and Gram-Schmidt (QR) of its rows is worse than that at every noise.
+    is that of least squares. We know no stronger closed form of its kind. The polar factor of the affine camera itself
+    is `lsq_svd`, and Gram-Schmidt (QR) of its rows is worse than that at every noise.
     """
     points = centred(S, W, weights)
     x, y = _affine(points).transpose(1, 2, 0)

@@ -63,9 +63,11 @@ def compare(replayed: Replay, recording: Path) -> tuple[Replay, dict]:
     """Compare the live node with the replay, joined by header.stamp.
 
     Returns:
-        The replay with the live points in place of its own, without the frames that the node lost; and the agreement:
-        frames_lost, frames_unknown, frames_with_other_persons (counts), order_kept (bool) and
-        max_difference_relative (largest coordinate difference over the skeleton's size).
+        The replay with the live points in place of its own, without the frames that the node lost. Then the agreement:
+
+        - frames_lost, frames_unknown, frames_with_other_persons: counts.
+        - order_kept: bool.
+        - max_difference_relative: largest coordinate difference over the skeleton's size.
     """
     order, live = [], {}
     for _, _, message, _ in read_messages(recording, [f"{NODE_NAME}/poses"]):

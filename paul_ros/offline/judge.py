@@ -42,26 +42,27 @@ def evaluate(done: Replay) -> dict:
     Returns:
         The report, ready for JSON. A value is None where it cannot be had.
 
-        bag, model, model_sha256, layout, input_layout, units ('m' or 'model'), damage, versions: what was judged.
-        frames, persons, lifted: counts of messages, of persons in them, and of lifted persons.
-        dropped, noted: reason -> count of discarded, and of odd but used, messages and persons.
-        advice: reason -> what to do about it.
-        persons_with_truth: count of persons that the errors are about.
-        points_with_truth_share: share (0 to 1) of their points that have a ground truth.
-        n_mpjpe_mm, pa_mpjpe_mm: mean point error after scaling, and after a similarity transform, in mm.
-        ne_flip_frame_percent, ne_flip_global_percent: normalised error in %, with the better of both mirror images
-            taken for each person, and once for all. None in model units.
-        root_error_median_mm, root_error_median_percent: error of the root's position in mm, and in % of its
-            distance from the camera. None in model units.
-        baseline: the same errors of the model's rigid mean shape.
-        reprojection_median_px: median distance of the lifted points from the keypoints, in pixels.
-        certified_share: share (0 to 1) of lifted persons whose pose is proven optimal.
-        ambiguous_share: share (0 to 1) of lifted persons whose mirror image fits nearly as well.
-        distance_sigma_median_m: median of the stated standard deviation of the distance, in metres.
-        distance_within_1_sigma_share, distance_within_2_sigma_share: share (0 to 1) of persons whose distance error
-            is at most once, and at most twice, the stated standard deviation.
-        pairs_of_frames, flips_per_1000_frames: see `count_flips`.
-        lift_us_median, lift_us_p99: time to lift a message, in microseconds.
+        - bag, model, model_sha256, layout, input_layout, units ('m' or 'model'), damage, versions: what was judged.
+        - frames, persons, lifted: counts of messages, of persons in them, and of lifted persons.
+        - dropped, noted: reason -> count of discarded, and of odd but used, messages and persons.
+        - advice: reason -> what to do about it.
+        - persons_with_truth: count of persons that the errors are about.
+        - points_with_truth_share: share (0 to 1) of their points that have a ground truth.
+        - n_mpjpe_mm: mean point error after scaling, in mm.
+        - pa_mpjpe_mm: mean point error after a similarity transform, in mm.
+        - ne_flip_frame_percent: normalised error in %, of the better mirror image of each person. Needs metres.
+        - ne_flip_global_percent: normalised error in %, of the better mirror image of all together. Needs metres.
+        - root_error_median_mm: error of the root's position in mm. Needs metres.
+        - root_error_median_percent: the same in % of the distance from the camera. Needs metres.
+        - baseline: the same six errors of the model's rigid mean shape.
+        - reprojection_median_px: median distance of the lifted points from the keypoints, in pixels.
+        - certified_share: share (0 to 1) of lifted persons whose pose is proven optimal.
+        - ambiguous_share: share (0 to 1) of lifted persons whose mirror image fits nearly as well.
+        - distance_sigma_median_m: median of the stated standard deviation of the distance, in metres.
+        - distance_within_1_sigma_share: share (0 to 1) of persons whose distance error is within that deviation.
+        - distance_within_2_sigma_share: share (0 to 1) of persons whose distance error is within twice that deviation.
+        - pairs_of_frames, flips_per_1000_frames: see `count_flips`.
+        - lift_us_median, lift_us_p99: time to lift a message, in microseconds.
     """
     stream = done.stream
     model = stream.lifter.model
