@@ -469,7 +469,7 @@ def deepest(tmp_path_factory):
     ids=["still", "moves a little", "grows", "shrinks", "walks by"],
 )
 def test_a_flip_needs_an_image_that_stays(deepest, growth, shift, flips):
-    """A person that moves in the image by 30 % of its size may have turned; a shift of the whole person does not count."""
+    """A person that moves in the image by 30 % of its size may have turned; a shift does not count."""
     lifted = replace(deepest.lifted, points=mirrored_in_depth(deepest.lifted))
     middle = deepest.given.xy[deepest.given.visible].mean(0)
     given = replace(deepest.given, xy=deepest.given.xy + growth * (deepest.given.xy - middle) + shift)
