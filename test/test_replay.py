@@ -261,7 +261,7 @@ def test_without_camera_info(short, model_file, tmp_path):
 
 
 @pytest.mark.parametrize("bag", [ONE, TWO])
-def test_a_wrong_layout_is_noted(bag, tmp_path):
+def test_another_layout_of_as_many_points_is_reported(bag, tmp_path):
     """COCO's points in the order of Human3.6M have the right number, so only their shapes reveal them."""
     part = part_of(bag, tmp_path / "x.mcap", 4)
     right, wrong = (evaluate(replay(part, open_stream(None, layout))) for layout in ("coco17", "h36m17"))

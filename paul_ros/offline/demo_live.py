@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live run of the node in three processes: this one records, `paul_ros.ros.node` lifts, `demo_player` plays."""
+"""A live run of the node in three processes.
+
+This one records, `paul_ros.ros.node` lifts, `demo_player` plays.
+"""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from paul_ros.offline.film import PNG_PICTURES, Film, Progress
 from paul_ros.offline.film_files import check_format, write_film
 from paul_ros.offline.skeleton_drawing import draw_skeleton
 
-_VIEWS, _NOISE, _SEED = 2000, 0.3, 0  # random views that the modes are found from; noise over the points' rms
+_RANDOM_VIEWS, _NOISE, _SEED = 2000, 0.3, 0  # random views that the modes are found from; noise over the points' rms
 _MAX_MODES, _SWING = 3, 2.0  # standard deviations
 _PICTURES = 120
 
@@ -92,15 +92,15 @@ def code_modes(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         variance.
     """
     rng = np.random.default_rng(_SEED)
-    Q, _ = np.linalg.qr(rng.standard_normal((_VIEWS, 3, 3)))
+    Q, _ = np.linalg.qr(rng.standard_normal((_RANDOM_VIEWS, 3, 3)))
     shape = model.mean_shape.astype(float)
     W = (Q @ shape)[:, :2]
     W = W + _NOISE * shape.std() * rng.standard_normal(W.shape)
     # A model of one fixed scale takes image points in the unit of its training data.
     W = W * model.header.get("image_unit", 1.0)
-    codes = model.encode(W, np.ones((_VIEWS, shape.shape[1]), bool)).astype(float)
+    codes = model.encode(W, np.ones((_RANDOM_VIEWS, shape.shape[1]), bool)).astype(float)
     mean = codes.mean(0)
-    _, sizes, axes = np.linalg.svd((codes - mean) / np.sqrt(_VIEWS), full_matrices=False)
+    _, sizes, axes = np.linalg.svd((codes - mean) / np.sqrt(_RANDOM_VIEWS), full_matrices=False)
     count = min(_MAX_MODES, int((sizes > 1e-6 * max(sizes[0], 1e-12)).sum()))
     variance = sizes**2
     shares = variance[:count] / max(variance.sum(), 1e-300)
