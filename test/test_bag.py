@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags: what is written reads back; what is damaged gives all that lies before the damage, then one clear error."""
+"""Bags: written messages read back; a damaged bag gives everything before the damage, then one clear error."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def test_folder_without_mcap(tmp_path):
 
 
 def test_rosbag2_folder_of_several_files(tmp_path, bag):
-    """As a recorder splits them: metadata.yaml tells the order, not the names."""
+    """As a recorder splits them: metadata.yaml gives the order, not the names."""
     shutil.copy(bag, tmp_path / "z.mcap")
     write(tmp_path / "a.mcap", 3)
     assert len(list(read_messages(tmp_path))) == 206

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shipped recordings: remade bit for bit, small, and what their README says they are."""
+"""The shipped recordings: remade bit for bit, small, and as their README describes them."""
 
 from __future__ import annotations
 

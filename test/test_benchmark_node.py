@@ -87,15 +87,15 @@ def test_a_node_that_cannot_start_is_reported(monkeypatch, capsys):
     before = children()
     assert cli.main(["benchmark", "node"]) == 1
     assert children() == before
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told.startswith("paul: the lifter ended by itself (1)") and "none_such" in told
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert printed.startswith("paul: the lifter ended by itself (1)") and "none_such" in printed
 
 
 def test_without_ros_the_error_names_the_cure(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert cli.main(["benchmark", "node"]) == 1
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert "the benchmark needs ROS 2" in told and "paul_ros[ros]" in told
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert "the benchmark needs ROS 2" in printed and "paul_ros[ros]" in printed
 
 
 def test_without_the_recording_the_error_names_the_cure(monkeypatch, capsys):
@@ -181,9 +181,9 @@ def test_memory_growth_is_that_of_the_second_half():
 def test_cpu_time_of_another_process():
     code = "import sys, time\nwhile time.process_time() < 0.2: pass\nprint(time.process_time(), flush=True)\ninput()"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        told = float(child.stdout.readline())
+        printed = float(child.stdout.readline())
         time.sleep(0.05)
-        assert told <= cpu_seconds(child.pid) < told + 0.05
+        assert printed <= cpu_seconds(child.pid) < printed + 0.05
         child.communicate(b"\n")
 
 

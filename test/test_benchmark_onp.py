@@ -143,7 +143,7 @@ def test_hidden_points_are_far_off():
 
 def test_a_solver_that_calls_everything_certified_is_caught():
     def liar(S, W, weights, scale):
-        """The least-squares pose, said to be without residual and proven."""
+        """The least-squares pose, claimed to be exact and proven."""
         plain, honest = rivals.lsq_svd(S, W, weights, scale), onp.METHODS["ours"](S, W, weights, scale)
         return honest._replace(**plain._asdict() | {"residual": 0 * plain.residual}, certified=honest.certified | True)
 
@@ -232,7 +232,7 @@ def test_help_explains_every_column(capsys):
         assert f"\n  {column}" in text
 
 
-def test_an_output_that_cannot_be_written_is_told_first(monkeypatch, capsys, tmp_path):
+def test_an_output_that_cannot_be_written_is_refused_first(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(onp, "run", lambda *_: pytest.fail("measured in vain"))
     assert cli.main(["benchmark", "onp", "--json", str(tmp_path)]) == 1
     assert "it is a folder" in capsys.readouterr().err

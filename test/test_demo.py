@@ -89,7 +89,7 @@ def test_compare_measures_the_difference(two_seconds, model_file, tmp_path):
     assert agreement["frames_with_other_persons"] == 1
 
 
-def test_node_that_cannot_start_is_told(two_seconds, tmp_path):
+def test_node_that_cannot_start_is_reported(two_seconds, tmp_path):
     with pytest.raises(DemoError, match="no model 'nobody'"):
         run_live(two_seconds, tmp_path / "x.mcap", "nobody")
     assert not list(tmp_path.iterdir())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul view`: what is chosen of a bag, what is drawn, and files that are films."""
+"""`paul view`: the excerpt of a bag, the drawings, and the film files."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ def test_a_bag_as_gif(tmp_path, model_file, capsys):
     written = Image.open(out)
     assert (written.format, written.n_frames, written.size) == ("GIF", 11, (900, 500))
     assert written.info["duration"] == 100
-    told = capsys.readouterr().out
-    assert told == f"{out}: 11 pictures of 31 messages, 0.0 to 1.0 s of 1.0 s, in real time\n"
+    printed = capsys.readouterr().out
+    assert printed == f"{out}: 11 pictures of 31 messages, 0.0 to 1.0 s of 1.0 s, in real time\n"
     # The palette has the drawing's colours.
     assert has(np.asarray(written.convert("RGB")), LEFT) > 50 and has(np.asarray(written.convert("RGB")), RIGHT) > 50
 
@@ -218,7 +218,7 @@ def test_mp4_without_ffmpeg(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_mp4_by_ffmpeg(tmp_path, monkeypatch, fails):
-    """A stand-in that keeps what it is sent, under the name it is told last."""
+    """A stand-in that keeps what it is sent, under the name of its last argument."""
     program = tmp_path / "ffmpeg"
     keep = "import sys; open(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())"
     command = "echo no codec >&2; exit 3" if fails else f'exec {sys.executable} -c "{keep}" "$@"'

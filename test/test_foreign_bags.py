@@ -172,8 +172,8 @@ def test_paul_replay_reads_it(tmp_path, model_file, name):
     bag, report = write(tmp_path / "in.mcap", name), tmp_path / "report.json"
     arguments = ["replay", bag, "--model", model_file, "--json", report, "--topic", topics_for(name).keypoints]
     assert cli.main([str(argument) for argument in arguments]) == 0
-    told = json.loads(report.read_text())
-    assert (told["frames"], told["persons"], told["dropped"], told["units"]) == (FRAMES, 2 * FRAMES, {}, "m")
+    found = json.loads(report.read_text())
+    assert (found["frames"], found["persons"], found["dropped"], found["units"]) == (FRAMES, 2 * FRAMES, {}, "m")
 
 
 def test_one_of_several_bodies(tmp_path, model_file):

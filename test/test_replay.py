@@ -99,9 +99,11 @@ def test_lifted_bag_holds_inputs_and_outputs(short, model_file, tmp_path):
         published = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses]).reshape(-1, 17, 3)
         assert np.array_equal(published, frame.lifted.points[frame.lifted.ok])
     # The first frames show nobody, so the input's layout is known only later.
-    told = [json.loads(message.data) for _, _, message, _ in read_messages(tmp_path / "out.mcap", ["/lifter/layout"])]
-    assert [layout["input_layout"] for layout in told] == [None, "coco17"]
-    assert all(layout["units"] == "m" and layout["layout"] == "coco17" for layout in told)
+    described = [
+        json.loads(message.data) for _, _, message, _ in read_messages(tmp_path / "out.mcap", ["/lifter/layout"])
+    ]
+    assert [layout["input_layout"] for layout in described] == [None, "coco17"]
+    assert all(layout["units"] == "m" and layout["layout"] == "coco17" for layout in described)
     latched = next(r for r in read_records(tmp_path / "out.mcap", ["/lifter/layout"]))
     assert "transient_local" in latched.qos
 
@@ -121,7 +123,7 @@ def test_report_keys_and_counts(model_file):
 
 
 def test_the_truth_itself_has_no_error(short, model_file):
-    """Predictions replaced by the truth, then moved by a known step: every error must be what it was made."""
+    """Predictions are replaced by the truth and moved by a known step, which fixes every error."""
     done = replay(short, open_stream(model_file))
     for frame in done.frames:
         frame.lifted.points[frame.lifted.ok] = done.truth[frame.stamp][frame.lifted.ok] + (0.03, 0.0, 0.04)
@@ -171,7 +173,7 @@ def partial(short, model_file):
 
 
 def test_truth_of_some_points(partial):
-    """As the measures give it of those points alone."""
+    """The errors are those of the measures over the points that have a truth."""
     done, has = partial
     report = evaluate(done)
     parts = {"n_mpjpe": [], "pa_mpjpe": [], "normalised_error": [], "mirrored": []}
@@ -267,8 +269,8 @@ def test_another_layout_of_as_many_points_is_reported(bag, tmp_path):
     right, wrong = (evaluate(replay(part, open_stream(None, layout))) for layout in ("coco17", "h36m17"))
     assert not right["noted"] and "noted" not in table(right)
     assert wrong["noted"]["unlike_the_model"] > 0.9 * wrong["lifted"] > 50
-    said = next(line for line in table(wrong).splitlines() if "noted" in line)
-    assert "layout 'h36m17'" in said and "set the parameter `layout`" in said
+    noted = next(line for line in table(wrong).splitlines() if "noted" in line)
+    assert "layout 'h36m17'" in noted and "set the parameter `layout`" in noted
 
 
 def test_no_person_at_all(model_file, tmp_path):
@@ -328,7 +330,7 @@ def test_topic_of_the_wrong_type(short, model_file, tmp_path, topics, clue):
     assert not list(tmp_path.iterdir())
 
 
-def test_output_that_cannot_be_written_is_told_before_anything_is_lifted(short, model_file, tmp_path):
+def test_output_that_cannot_be_written_is_refused_before_the_work(short, model_file, tmp_path):
     for output, clue in (tmp_path, "it is a folder"), (Path("/proc/x.mcap"), "cannot write /proc/x.mcap"):
         lifted = []
         with pytest.raises(OutputError, match=clue):
@@ -433,7 +435,7 @@ def test_the_distance_is_as_wrong_as_it_says(short, model_file):
 
 
 def test_flips_are_counted(model_file):
-    """Persons mirrored in depth, or turned about, in single frames; not those that move in the image as well."""
+    """Persons are mirrored in depth in single frames while their images stay."""
     done = replay(TWO, open_stream(model_file))
     clean = count_flips(done.frames)
     for frame in done.frames[100:200:10]:
@@ -485,7 +487,7 @@ def test_persons_without_id_have_no_flips(short, model_file):
 
 
 def test_the_filter_works_in_replay_as_in_the_stream(short, model_file, tmp_path):
-    """And what is written are the filtered points."""
+    """The bag holds the filtered points."""
     raw, calm = (replay(short, open_stream(model_file, smoothing=hz), tmp_path / f"{hz}.mcap") for hz in (0.0, 0.5))
     moved = [np.abs(a.lifted.points - b.lifted.points)[a.lifted.ok] for a, b in zip(raw.frames, calm.frames)]
     assert np.concatenate(moved).max() > 0.05

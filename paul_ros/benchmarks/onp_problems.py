@@ -94,7 +94,7 @@ def problems(scenario: Scenario, count: int, rng: np.random.Generator) -> Proble
     spread = np.sqrt((spread**2).mean(axis=1, keepdims=True))
     zoom = 10 ** rng.uniform(-3, 3, (count, 1, 1)) if scenario.scale == "free" else np.ones((count, 1, 1))
     shift = spread * rng.normal(0, 3, (count, 3, 1))
-    truth = zoom * (random_rotations(count, rng) @ true + shift)
+    truth = zoom * (_random_rotations(count, rng) @ true + shift)
     W = truth[:, :2] + scenario.noise * zoom * spread * rng.standard_normal((count, 2, P))
     S = true + scenario.shape_noise * spread * rng.standard_normal((count, 3, P))
     if not (scenario.hidden or scenario.weighted):
@@ -122,12 +122,12 @@ def _human_poses(count: int, rng: np.random.Generator) -> np.ndarray:
     """Return bodies (N,3,17) in varied poses: shapes that the shipped model gives for noisy views of its mean shape."""
     model = _human_model()
     mean = model.mean_shape.astype(float)
-    views = (random_rotations(count, rng) @ mean)[:, :2]
+    views = (_random_rotations(count, rng) @ mean)[:, :2]
     views += _POSE_VARIETY * mean.std() * rng.standard_normal(views.shape)
     return model.shape(views, np.ones((count, mean.shape[1]), bool)).astype(float)
 
 
-def random_rotations(count: int, rng: np.random.Generator) -> np.ndarray:
+def _random_rotations(count: int, rng: np.random.Generator) -> np.ndarray:
     """Return uniform rotations (N,3,3): the orthogonal factors of normal matrices, with the signs of R and det +1."""
     Q, R = np.linalg.qr(rng.standard_normal((count, 3, 3)))
     Q = Q * np.sign(np.diagonal(R, axis1=1, axis2=2))[:, None]
