@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Remakes the two recordings beside this file, bit for bit, from the motion-capture clips in source/.
+"""Make the two recordings beside this file, bit for bit, from the motion-capture clips in source/.
 
     python bags/make_bags.py [FOLDER]
 
-World: metres, y up, the camera above the origin, looking along +z and a little down; to its right is -x.
+World frame: metres, y up. The camera is above the origin and looks along +z and a little down; its right is -x.
 """
 
 from __future__ import annotations
@@ -22,19 +22,28 @@ sys.path.insert(0, str(HERE.parent))  # run from a checkout that nobody installe
 
 from msg_adapters.outputs import keypoints_cloud, pose_array  # noqa: E402
 from paul_ros.layout import load_layout  # noqa: E402
-from paul_ros.offline.bag import BagMessages, BagWriter  # noqa: E402
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from training.people.mocap import layout_points  # noqa: E402
 
 RATE = 30  # Hz
-START = 1_750_000_000 * 1_000_000_000  # ns; any time will do
+START = 1_750_000_000 * 1_000_000_000  # ns, arbitrary
 FRAME_ID = "camera_color_optical_frame"
 LEFT_ARM, RIGHT_ARM, LEFT_LEG, RIGHT_LEG = (5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16)
-MIN_POINTS_SEEN = 4  # a detector finds no person in fewer
+MIN_POINTS_SEEN = 4  # a detector finds no person with fewer
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera at `height` metres, pitched down."""
+    """A pinhole camera.
+
+    Attributes:
+        width: pixels.
+        height_px: pixels.
+        focal: focal length in pixels.
+        height: height above the ground in metres.
+        pitch_deg: angle in degrees by which the camera looks down.
+    """
 
     width: int = 1280
     height_px: int = 720
@@ -43,25 +52,33 @@ class Camera:
     pitch_deg: float = 4.0
 
     def see(self, world: np.ndarray) -> np.ndarray:
-        """World points (...,3) in the optical frame, to the micrometre so that no platform rounds them otherwise."""
+        """Map world points (...,3) to the optical frame, to the micrometre, so that all platforms round alike."""
         sin, cos = math.sin(math.radians(self.pitch_deg)), math.cos(math.radians(self.pitch_deg))
         x, down, ahead = -world[..., 0], self.height - world[..., 1], world[..., 2]
         return np.round(np.stack([x, cos * down - sin * ahead, sin * down + cos * ahead], axis=-1), 6)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Optical-frame points (...,3) in pixels (...,2)."""
+        """Map points (...,3) of the optical frame to pixels (...,2)."""
         centre = np.array([self.width / 2, self.height_px / 2])
         return self.focal * points[..., :2] / points[..., 2:] + centre
 
     def inside(self, xy: np.ndarray) -> np.ndarray:
-        return ((xy >= 0) & (xy < [self.width, self.height_px])).all(axis=-1)
+        """Return which pixels (...,2) lie in the image, (...) bool."""
+        return np.all((xy >= 0) & (xy < [self.width, self.height_px]), axis=-1)
 
 
 @dataclass(frozen=True)
 class Person:
-    """A clip put into the world: turned by yaw about the vertical through `pivot`, which comes to stand at `place`.
+    """A clip placed in the world.
 
-    Both are (x, z), of the clip and of the world.
+    Attributes:
+        ident: id of the person.
+        clip: name of the clip in source/.
+        yaw_deg: rotation in degrees about the vertical through `pivot`.
+        pivot: (x, z) of the clip in metres.
+        place: (x, z) of the world in metres, where `pivot` comes to stand.
+        first_frame: frame of the bag at which the clip begins.
+        floor: metres by which the clip is lowered.
     """
 
     ident: int
@@ -69,11 +86,11 @@ class Person:
     yaw_deg: float
     pivot: tuple[float, float]
     place: tuple[float, float]
-    first_frame: int = 0  # frame of the bag at which the clip begins
-    floor: float = 0.0  # metres by which the clip is lowered
+    first_frame: int = 0
+    floor: float = 0.0
 
     def points(self) -> np.ndarray:
-        """COCO-17 in the world, (F,17,3) metres."""
+        """Return COCO-17 points in the world, (F,17,3) metres."""
         with np.load(HERE / "source" / f"{self.clip}.npz", allow_pickle=False) as file:
             points = layout_points(file["joints"], load_layout("coco17"))
         sin, cos = math.sin(math.radians(self.yaw_deg)), math.cos(math.radians(self.yaw_deg))
@@ -85,16 +102,23 @@ class Person:
 
 @dataclass(frozen=True)
 class Seen:
-    """One person in one frame: truth in the optical frame (17,3) and what the detector says of it."""
+    """One detected person in one frame.
+
+    Attributes:
+        ident: id of the person.
+        truth: (17,3) metres, optical frame.
+        xy: (17,2) detected pixels, NaN = hidden.
+        confidence: (17,), 0 = hidden.
+    """
 
     ident: int
     truth: np.ndarray
-    xy: np.ndarray  # (17,2), NaN where hidden
-    confidence: np.ndarray  # (17,), 0 where hidden
+    xy: np.ndarray
+    confidence: np.ndarray
 
 
 def one_person() -> tuple[Camera, list[list[Seen]]]:
-    """Climbs, swings, jumps, sits and walks, about 4.6 m away; every point seen, no noise."""
+    """Return a person about 4.6 m away who climbs, swings, jumps, sits and walks; all points visible, no noise."""
     camera = Camera()
     person = Person(1, "01_14", yaw_deg=60.0, pivot=(0.4, 0.85), place=(0.0, 4.6))
     frames = camera.see(person.points())
@@ -102,7 +126,7 @@ def one_person() -> tuple[Camera, list[list[Seen]]]:
 
 
 def two_persons() -> tuple[Camera, list[list[Seen]]]:
-    """Two walkers who cross; occlusion, image border, dropouts and detector noise hide and move points."""
+    """Return two walkers who cross; occlusion, image border and dropouts hide points, detector noise moves them."""
     camera = Camera()
     persons = [
         Person(3, "03_04", yaw_deg=90.0, pivot=(0.3, 1.8), place=(2.8, 3.6), first_frame=10, floor=0.2),
@@ -114,7 +138,7 @@ def two_persons() -> tuple[Camera, list[list[Seen]]]:
 
 
 def _on_one_clock(camera: Camera, persons: list[Person], seconds: float) -> list[list[tuple[int, np.ndarray]]]:
-    """For each frame of the bag, (ident, truth) of whoever's clip is running."""
+    """Return (ident, truth) of the persons whose clip is running, for each frame of the bag."""
     frames: list[list] = [[] for _ in range(round(seconds * RATE))]
     for person in persons:
         for number, truth in enumerate(camera.see(person.points()), person.first_frame):
@@ -124,7 +148,7 @@ def _on_one_clock(camera: Camera, persons: list[Person], seconds: float) -> list
 
 
 def _detect(camera: Camera, truths: list[tuple[int, np.ndarray]], rng: np.random.Generator) -> list[Seen]:
-    """What a detector makes of one frame; the largest in the image comes first, so rows are not persons."""
+    """Return the detections of one frame; the tallest in the image comes first, so rows are not persons."""
     found = []
     for ident, truth in truths:
         xy = camera.project(truth)
@@ -147,7 +171,7 @@ def _detect(camera: Camera, truths: list[tuple[int, np.ndarray]], rng: np.random
 
 
 def _behind(camera: Camera, xy: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Which of the points xy (17,2) the body `other` (17,3) covers: a body is capsules about its bones."""
+    """Return which of the points xy (17,2) a body (17,3), made of capsules about its bones, covers."""
     mid = [other[[5, 6]].mean(axis=0), other[[11, 12]].mean(axis=0)]
     capsules = [(mid[0], mid[1], 0.18), (other[3], other[4], 0.12)]
     for limb in (LEFT_ARM, RIGHT_ARM, LEFT_LEG, RIGHT_LEG):
@@ -162,7 +186,7 @@ def _behind(camera: Camera, xy: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def write(path: Path, camera: Camera, frames: list[list[Seen]]) -> None:
-    """Uncompressed chunks: the bytes then depend on no compressor's version."""
+    """Write a bag with uncompressed chunks, so that its bytes depend on no compressor's version."""
     make = BagMessages()
     with BagWriter(path, make, compression="none") as bag:
         for number, persons in enumerate(frames):
@@ -205,6 +229,7 @@ BAGS = {"one_person.mcap": one_person, "two_persons_crossing.mcap": two_persons}
 
 
 def main(folder: Path) -> None:
+    """Write both bags to a folder."""
     for name, scene in BAGS.items():
         camera, frames = scene()
         write(folder / name, camera, frames)

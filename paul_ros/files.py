@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Collection
@@ -66,3 +67,8 @@ def write_atomically(path: str | os.PathLike, data: bytes) -> None:
         if isinstance(error, OSError):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def write_json(path: str | os.PathLike, report: dict) -> None:
+    """Write a report as one JSON object, atomically."""
+    write_atomically(path, (json.dumps(report, indent=2, ensure_ascii=False) + "\n").encode())

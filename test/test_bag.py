@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags: what is written reads back; what is damaged gives all that lies before the damage, then one clear error."""
+"""Bags: written messages read back; a damaged bag gives everything before the damage, then one clear error."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import shutil
 
 import numpy as np
 import pytest
+from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from paul_ros.errors import BagError
-from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
+from paul_ros.errors import BagError, OutputError
+from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 
 POSES = "geometry_msgs/msg/PoseArray"
 TICK = 33_333_333
@@ -127,6 +130,41 @@ def test_any_changed_byte_is_noticed(bag, tmp_path):
         assert [time for *_, time in found] == expected[: len(found)]
 
 
+@pytest.fixture
+def unchunked(tmp_path):
+    """A bag without chunks and checksums, as a fast recorder writes it: 20 messages."""
+    make, path = BagMessages(), tmp_path / "unchunked.mcap"
+    with open(path, "wb") as file:
+        writer = McapWriter(file, use_chunking=False, enable_crcs=False)
+        writer.start("ros2", "a fast recorder")
+        schema = writer.register_schema(POSES, "ros2msg", make.definition(POSES).encode())
+        channel = writer.register_channel("/poses", "cdr", schema)
+        for number in range(20):
+            writer.add_message(channel, number, make.serialise(poses(make, number)), number)
+        writer.finish()
+    return path
+
+
+def test_a_message_that_the_end_cuts_is_not_read(unchunked):
+    """The mcap library alone would yield half a message."""
+    assert len(list(read_records(unchunked))) == 20
+    whole, counts = unchunked.read_bytes(), []
+    for size in range(3000, 8000, 97):
+        unchunked.write_bytes(whole[:size])
+        found, error = read_until_damage(unchunked)
+        assert error is not None and "ends too early" in str(error) and error.messages_read == len(found)
+        assert all(len(message.poses) == 40 for _, message, _ in found)
+        counts.append(len(found))
+    assert len(set(counts)) > 2
+
+
+def test_bytes_after_the_end_are_noticed(unchunked):
+    with open(unchunked, "ab") as file:
+        file.write(b"x")
+    found, error = read_until_damage(unchunked)
+    assert len(found) == 20 and "goes on after the end mark" in str(error)
+
+
 @pytest.mark.parametrize(
     "content, clue",
     [
@@ -136,7 +174,7 @@ def test_any_changed_byte_is_noticed(bag, tmp_path):
         (b"\x89MC", "not an mcap file"),
     ],
 )
-def test_what_is_no_bag(tmp_path, content, clue):
+def test_other_files_are_refused(tmp_path, content, clue):
     path = tmp_path / "odd.mcap"
     path.write_bytes(content)
     found, error = read_until_damage(path)
@@ -155,7 +193,7 @@ def test_folder_without_mcap(tmp_path):
 
 
 def test_rosbag2_folder_of_several_files(tmp_path, bag):
-    """As a recorder splits them: metadata.yaml tells the order, not the names."""
+    """As a recorder splits them: metadata.yaml gives the order, not the names."""
     shutil.copy(bag, tmp_path / "z.mcap")
     write(tmp_path / "a.mcap", 3)
     assert len(list(read_messages(tmp_path))) == 206
@@ -223,7 +261,7 @@ def test_failure_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_a_full_disk_leaves_nothing(tmp_path):
     (tmp_path / "a.mcap.part").symlink_to("/dev/full")
-    with pytest.raises(BagError, match="cannot write .*a.mcap: No space left"):
+    with pytest.raises(OutputError, match="cannot write .*a.mcap: No space left"):
         write(tmp_path / "a.mcap")
     assert not list(tmp_path.iterdir())
 
@@ -231,7 +269,7 @@ def test_a_full_disk_leaves_nothing(tmp_path):
 @pytest.mark.parametrize("path, clue", [("", "it is a folder"), ("file/a.mcap", "cannot write .*file/a.mcap: ")])
 def test_where_nothing_can_be_written(tmp_path, path, clue):
     (tmp_path / "file").touch()
-    with pytest.raises(BagError, match=clue):
+    with pytest.raises(OutputError, match=clue):
         write(tmp_path / path)
     assert [file.name for file in tmp_path.iterdir()] == ["file"]
 

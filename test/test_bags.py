@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shipped recordings: remade bit for bit, small, and what their README says they are."""
+"""The shipped recordings: remade bit for bit, small, and as their README describes them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import msg_adapters
 from msg_adapters.keypoints import stamp_ns
 from paul_ros.layout import load_layout
-from paul_ros.offline.bag import read_messages, topics_of
+from paul_ros.offline.bag_reader import read_messages, topics_of
 from training.people.mocap import CMU31, layout_points
 
 BAGS = Path(__file__).resolve().parent.parent / "bags"

@@ -16,12 +16,14 @@ from conftest import ROOT
 
 import msg_adapters
 from paul_ros import cli
-from paul_ros.benchmarks import node
-from paul_ros.benchmarks.node import Turn, clouds, cpu_seconds, memory_growth, ratios, row, spread
+from paul_ros.benchmarks import node, node_messages, node_processes
+from paul_ros.benchmarks.node import memory_growth, ratios, row
+from paul_ros.benchmarks.node_messages import clouds, spread
+from paul_ros.benchmarks.node_processes import Turn, cpu_seconds
 from paul_ros.benchmarks.node_report import table
 from paul_ros.benchmarks.traffic import NODES
 from paul_ros.errors import BagError
-from paul_ros.offline.bag import _jazzy
+from paul_ros.offline.bag_records import jazzy_typestore
 
 KEYS = {
     "node",
@@ -80,27 +82,27 @@ def test_a_short_soak(monkeypatch, tmp_path, capsys):
     assert "MB an hour" in capsys.readouterr().out and files[1].read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_node_that_cannot_start_is_told(monkeypatch, capsys):
-    monkeypatch.setitem(node._MODULES, "lifter", "paul_ros.benchmarks.none_such")
+def test_a_node_that_cannot_start_is_reported(monkeypatch, capsys):
+    monkeypatch.setitem(node_processes.MODULES, "lifter", "paul_ros.benchmarks.none_such")
     before = children()
     assert cli.main(["benchmark", "node"]) == 1
     assert children() == before
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told.startswith("paul: the lifter ended by itself (1)") and "none_such" in told
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert printed.startswith("paul: the lifter ended by itself (1)") and "none_such" in printed
 
 
-def test_without_ros_it_is_said_what_to_install(monkeypatch, capsys):
+def test_without_ros_the_error_names_the_cure(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert cli.main(["benchmark", "node"]) == 1
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert "the benchmark needs ROS 2" in told and "paul_ros[ros]" in told
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert "the benchmark needs ROS 2" in printed and "paul_ros[ros]" in printed
 
 
-def test_without_the_recording_it_is_said_what_to_do(monkeypatch, capsys):
+def test_without_the_recording_the_error_names_the_cure(monkeypatch, capsys):
     def missing(name):
         raise BagError(f"the recording '{name}' is not installed")
 
-    monkeypatch.setattr(node, "find_bag", missing)
+    monkeypatch.setattr(node_messages, "find_bag", missing)
     assert cli.main(["benchmark", "node"]) == 1
     assert "is not installed" in capsys.readouterr().err
 
@@ -117,7 +119,7 @@ def test_odd_settings_are_refused(words, capsys):
 def test_clouds_are_what_the_adapter_reads():
     sent = clouds(3)
     assert sent.shape[0] == 60
-    read = msg_adapters.read(CLOUD, _jazzy().deserialize_cdr(sent[7].tobytes(), CLOUD), 17)
+    read = msg_adapters.read(CLOUD, jazzy_typestore().deserialize_cdr(sent[7].tobytes(), CLOUD), 17)
     assert read.persons == 3 and read.visible.all() and read.ids == ("0", "1", "2")
     assert read.stamp == 0 and read.frame_id == "camera_color_optical_frame"
 
@@ -179,9 +181,9 @@ def test_memory_growth_is_that_of_the_second_half():
 def test_cpu_time_of_another_process():
     code = "import sys, time\nwhile time.process_time() < 0.2: pass\nprint(time.process_time(), flush=True)\ninput()"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        told = float(child.stdout.readline())
+        printed = float(child.stdout.readline())
         time.sleep(0.05)
-        assert told <= cpu_seconds(child.pid) < told + 0.05
+        assert printed <= cpu_seconds(child.pid) < printed + 0.05
         child.communicate(b"\n")
 
 

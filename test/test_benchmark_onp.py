@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from paul_ros import cli
 from paul_ros.benchmarks import naive, onp, rivals
-from paul_ros.benchmarks.onp import Scenario, judge_scenario, problems
+from paul_ros.benchmarks.onp import judge_scenario
+from paul_ros.benchmarks.onp_problems import Scenario, problems
 from paul_ros.benchmarks.onp_report import table
 
 SCALES = ("free", "unit")
@@ -99,7 +100,7 @@ def test_polar_beats_the_least_squares_it_starts_from():
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("kind", [{"points": 4}, {"thickness": 0.05}, {"thickness": 0.0}, {"hidden": 0.5}])
 def test_the_naive_search_finds_the_optimum(scale, kind):
-    """That BFGS finds, from 20 random rotations and a scale."""
+    """BFGS from 20 random rotations and a scale finds the same."""
     data = given(scale, 4, **kind)
     found = naive.naive_optimum(*data[:3], scale)
     weights = np.ones(data.S[:, 0].shape) if data.weights is None else data.weights
@@ -118,7 +119,7 @@ def test_the_naive_search_finds_the_optimum(scale, kind):
 
 
 def test_the_naive_search_shares_nothing_with_the_solver():
-    """Nor do the rivals: a fault in common would hide itself."""
+    """The rivals do not either: a common fault would stay hidden."""
     for module in (naive, rivals):
         assert not [name for name, value in vars(module).items() if "onp" in str(getattr(value, "__module__", ""))]
         assert "viewing_sphere" not in vars(module) and "paul_ros.onp import" not in Path(module.__file__).read_text()
@@ -142,7 +143,7 @@ def test_hidden_points_are_far_off():
 
 def test_a_solver_that_calls_everything_certified_is_caught():
     def liar(S, W, weights, scale):
-        """The least-squares pose, said to be without residual and proven."""
+        """The least-squares pose, claimed to be exact and proven."""
         plain, honest = rivals.lsq_svd(S, W, weights, scale), onp.METHODS["ours"](S, W, weights, scale)
         return honest._replace(**plain._asdict() | {"residual": 0 * plain.residual}, certified=honest.certified | True)
 
@@ -212,7 +213,8 @@ def test_the_table_shows_what_was_wrong(short):
 def test_a_missing_package_is_one_line(module, monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(["benchmark", "onp", "--cases", "5", "--plot", str(tmp_path / "p.png")]) == 1
-    assert f"'{module}' is missing: pip install 'paul_ros[benchmark]'\n" in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert printed.err == (f"paul: the Python package '{module}' is missing: pip install 'paul_ros[benchmark]'\n")
 
 
 @pytest.mark.parametrize("words", [["--cases", "0"], ["--batch", "-3"], ["--cases", "many"]])
@@ -230,7 +232,7 @@ def test_help_explains_every_column(capsys):
         assert f"\n  {column}" in text
 
 
-def test_an_output_that_cannot_be_written_is_told_first(monkeypatch, capsys, tmp_path):
+def test_an_output_that_cannot_be_written_is_refused_first(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(onp, "run", lambda *_: pytest.fail("measured in vain"))
     assert cli.main(["benchmark", "onp", "--json", str(tmp_path)]) == 1
     assert "it is a folder" in capsys.readouterr().err

@@ -9,15 +9,19 @@ import numpy as np
 import pytest
 
 from paul_ros.errors import BagError, DemoError
-from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records, topics_of
-from paul_ros.offline.demo import BAGS, compare, find_bag, run_live
+from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.offline.demo import BAGS, compare
+from paul_ros.offline.demo_live import run_live
 from paul_ros.offline.replay import replay
+from paul_ros.offline.shipped_bags import find_bag
 from paul_ros.stream.stream import open_stream
 
 
 @pytest.fixture(scope="module")
 def two_seconds(tmp_path_factory):
-    """Of the crossing, from the first empty frames on until both are seen; without its truth."""
+    """Two seconds of the crossing, from empty frames until both persons are seen; without the ground truth."""
     path = tmp_path_factory.mktemp("demo") / "short.mcap"
     with BagWriter(path) as writer:
         for record in list(read_records(find_bag("two_persons_crossing"), ["/camera_info", "/keypoints"]))[40:160]:
@@ -85,7 +89,7 @@ def test_compare_measures_the_difference(two_seconds, model_file, tmp_path):
     assert agreement["frames_with_other_persons"] == 1
 
 
-def test_node_that_cannot_start_is_told(two_seconds, tmp_path):
+def test_node_that_cannot_start_is_reported(two_seconds, tmp_path):
     with pytest.raises(DemoError, match="no model 'nobody'"):
         run_live(two_seconds, tmp_path / "x.mcap", "nobody")
     assert not list(tmp_path.iterdir())

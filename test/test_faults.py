@@ -20,7 +20,7 @@ from node_bench import MAKE, PATIENCE, Bench, good
 from test_node import half_way
 
 from paul_ros.errors import BagError
-from paul_ros.offline.bag import read_messages, topics_of
+from paul_ros.offline.bag_reader import read_messages, topics_of
 
 ONE = ROOT / "bags/one_person.mcap"
 #: Publishes a good cloud at RATE Hz, its stamps from FIRST on, COUNT times once the node has answered one.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul view`: what is chosen of a bag, what is drawn, and files that are films."""
+"""`paul view`: the excerpt of a bag, the drawings, and the film files."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ from conftest import PERSON, camera_info, header_of, persons_at, seen
 from PIL import Image
 
 from msg_adapters import outputs
+from msg_adapters.palette import SIDE_COLOURS
 from paul_ros import cli
 from paul_ros.errors import BagError, PictureError
-from paul_ros.model_file import load_model
-from paul_ros.offline import film as view
-from paul_ros.offline.bag import BagMessages, BagWriter
-from paul_ros.offline.demo import find_bag
+from paul_ros.model import load_model
+from paul_ros.offline import film, film_excerpt, film_model, film_stage
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.offline.canvas import AMBER, turntable
+from paul_ros.offline.film_files import write_film
+from paul_ros.offline.shipped_bags import find_bag
 from paul_ros.stream.stream import open_stream
 
 MAKE = BagMessages()
@@ -42,7 +46,8 @@ def make_bag(path, frames: int, rate: float = 30.0, persons=lambda index: person
 def drawn(monkeypatch):
     """The pictures that would have been written."""
     pictures: list = []
-    monkeypatch.setattr(view, "write_film", lambda path, made: pictures.extend(made))
+    for module in (film, film_model):
+        monkeypatch.setattr(module, "write_film", lambda path, made: pictures.extend(made))
     return pictures
 
 
@@ -52,19 +57,19 @@ def has(picture: np.ndarray, colour: str) -> int:
     return int((np.abs(picture.astype(int) - rgb).max(axis=2) < 12).sum())
 
 
-LEFT, RIGHT = (view.SIDE_COLOUR[side] for side in ("left", "right"))
+LEFT, RIGHT = (SIDE_COLOURS[side] for side in ("left", "right"))
 
 
 def test_a_bag_as_gif(tmp_path, model_file, capsys):
     bag, out = make_bag(tmp_path / "walk.mcap", 31), tmp_path / "film.gif"
     assert cli.main(["view", str(bag), "-o", str(out), "--model", str(model_file)]) == 0
-    film = Image.open(out)
-    assert (film.format, film.n_frames, film.size) == ("GIF", 11, (900, 500))
-    assert film.info["duration"] == 100
-    told = capsys.readouterr().out
-    assert told == f"{out}: 11 pictures of 31 messages, 0.0 to 1.0 s of 1.0 s, as fast as in life\n"
+    written = Image.open(out)
+    assert (written.format, written.n_frames, written.size) == ("GIF", 11, (900, 500))
+    assert written.info["duration"] == 100
+    printed = capsys.readouterr().out
+    assert printed == f"{out}: 11 pictures of 31 messages, 0.0 to 1.0 s of 1.0 s, in real time\n"
     # The palette has the drawing's colours.
-    assert has(np.asarray(film.convert("RGB")), LEFT) > 50 and has(np.asarray(film.convert("RGB")), RIGHT) > 50
+    assert has(np.asarray(written.convert("RGB")), LEFT) > 50 and has(np.asarray(written.convert("RGB")), RIGHT) > 50
 
 
 def test_a_model_as_png(tmp_path, capsys, monkeypatch):
@@ -83,24 +88,24 @@ def test_the_name_of_the_film_is_the_bags(tmp_path, model_file, monkeypatch):
 
 
 def test_a_long_bag_is_shown_in_larger_steps(tmp_path, model_file, drawn, monkeypatch):
-    monkeypatch.setattr(view, "MOST_PICTURES", 5)
+    monkeypatch.setattr(film_excerpt, "MAX_PICTURES", 5)
     bag = make_bag(tmp_path / "long.mcap", 61)
-    film, _ = view.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
-    assert film.pictures == len(drawn) == 5
-    assert film.said == "5 pictures of 61 messages, 0.0 to 2.0 s of 2.0 s, 5.0 times as fast as in life"
+    drawn_film, _ = film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
+    assert drawn_film.pictures == len(drawn) == 5
+    assert drawn_film.summary == "5 pictures of 61 messages, 0.0 to 2.0 s of 2.0 s, 5.0 times as fast as real time"
 
 
 def test_a_part_of_a_bag(tmp_path, model_file, drawn):
     bag, stream = make_bag(tmp_path / "long.mcap", 61), open_stream(str(model_file))
-    film, _ = view.view_bag(bag, stream, tmp_path / "f.gif", start=1.0, seconds=0.5)
-    assert len(drawn) == 6 and "1.0 to 1.5 s of 2.0 s" in film.said
+    drawn_film, _ = film.view_bag(bag, stream, tmp_path / "f.gif", start=1.0, seconds=0.5)
+    assert len(drawn) == 6 and "1.0 to 1.5 s of 2.0 s" in drawn_film.summary
     assert stream.counts["frames"] == 6
 
 
 def test_no_keypoints_then(tmp_path, model_file):
     bag = make_bag(tmp_path / "short.mcap", 3)
     with pytest.raises(BagError, match="no keypoints from 9 s on"):
-        view.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif", start=9.0)
+        film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif", start=9.0)
 
 
 def test_no_keypoints_at_all(tmp_path, model_file, capsys):
@@ -112,10 +117,10 @@ def test_no_keypoints_at_all(tmp_path, model_file, capsys):
 def test_nobody_lifted(tmp_path, model_file):
     bag = make_bag(tmp_path / "empty.mcap", 3, persons=lambda index: np.empty((0, 17, 3)))
     with pytest.raises(PictureError, match="nobody was lifted"):
-        view.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
+        film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
 
 
-def test_half_a_bag_is_drawn_and_told(tmp_path, capsys):
+def test_half_a_bag_is_drawn_and_reported(tmp_path, capsys):
     whole = find_bag("one_person").read_bytes()
     bag, out = tmp_path / "half.mcap", tmp_path / "f.png"
     bag.write_bytes(whole[: len(whole) // 8])
@@ -133,7 +138,7 @@ def test_what_was_not_seen_is_pale(tmp_path, model_file, drawn):
         return body
 
     bag = make_bag(tmp_path / "hidden.mcap", 4, rate=10, persons=half_hidden)
-    view.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
+    film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
     turntables = [picture[100:440, 420:] for picture in drawn]
     assert has(turntables[0], LEFT) > 200 > 20 > has(turntables[1], LEFT)
     assert has(turntables[1], RIGHT) > 200
@@ -141,43 +146,43 @@ def test_what_was_not_seen_is_pale(tmp_path, model_file, drawn):
 
 def test_doubt_is_amber(tmp_path, model_file, drawn, monkeypatch):
     bag, stream = make_bag(tmp_path / "one.mcap", 1), open_stream(str(model_file))
-    monkeypatch.setattr(view, "AMBIGUOUS", 2.0)
-    view.view_bag(bag, stream, tmp_path / "f.gif")
-    monkeypatch.setattr(view, "AMBIGUOUS", 0.0)
-    view.view_bag(bag, stream, tmp_path / "f.gif")
+    monkeypatch.setattr(film_stage, "AMBIGUOUS", 2.0)
+    film.view_bag(bag, stream, tmp_path / "f.gif")
+    monkeypatch.setattr(film_stage, "AMBIGUOUS", 0.0)
+    film.view_bag(bag, stream, tmp_path / "f.gif")
     sure, doubtful = drawn
-    assert has(sure, view._AMBER) == 0
-    assert has(doubtful[:30], view._AMBER) > 10_000 and has(doubtful[60:], view._AMBER) > 200
+    assert has(sure, AMBER) == 0
+    assert has(doubtful[:30], AMBER) > 10_000 and has(doubtful[60:], AMBER) > 200
 
 
 def test_without_a_camera(tmp_path, model_file, drawn):
     bag = make_bag(tmp_path / "pixels.mcap", 2, rate=10, camera=False)
-    view.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
+    film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
     assert len(drawn) == 2 and has(drawn[0], LEFT) > 200
 
 
 def test_the_turntable():
-    np.testing.assert_allclose(view.turntable(0.3) @ view.turntable(0.3).T, np.eye(3), atol=1e-12)
-    up = view.turntable(1.0) @ np.array([0, -1.0, 0])
+    np.testing.assert_allclose(turntable(0.3) @ turntable(0.3).T, np.eye(3), atol=1e-12)
+    up = turntable(1.0) @ np.array([0, -1.0, 0])
     assert up[1] < -0.9 and abs(up[0]) < 1e-12
-    # Who looks down sees what is farther off higher in the picture.
-    assert (view.turntable(0.0) @ np.array([0, 0, 1.0]))[1] * -1 > 0.1
+    # A viewer who looks down sees farther points higher in the picture.
+    assert (turntable(0.0) @ np.array([0, 0, 1.0]))[1] * -1 > 0.1
     # A quarter turn brings the right to where the far side was.
-    np.testing.assert_allclose(np.abs((view.turntable(np.pi / 2) @ np.array([1.0, 0, 0]))[0]), 0, atol=1e-12)
+    np.testing.assert_allclose(np.abs((turntable(np.pi / 2) @ np.array([1.0, 0, 0]))[0]), 0, atol=1e-12)
 
 
 def test_a_model_is_seen_from_the_front(model_file):
     model = load_model(model_file)
-    shape = view._towards(model) @ model.mean_shape
+    shape = film_model._front_view(model) @ model.mean_shape
     at = dict(zip(model.layout.names, shape.T))
     assert at["nose"][1] < at["left_hip"][1] < at["left_ankle"][1]
     assert at["left_shoulder"][0] > at["right_shoulder"][0]
     assert at["nose"][2] < at["left_ear"][2]
-    assert np.linalg.det(view._towards(model)) == pytest.approx(1)
+    assert np.linalg.det(film_model._front_view(model)) == pytest.approx(1)
 
 
 def test_modes_of_codes():
-    mean, modes, shares = view.code_modes(load_model())
+    mean, modes, shares = film_model.code_modes(load_model())
     assert mean.shape == (16,) and modes.shape == (3, 16)
     np.testing.assert_allclose((modes @ modes.T)[~np.eye(3, dtype=bool)], 0, atol=1e-9)
     assert (np.diff(shares) < 0).all() and 0 < shares.sum() <= 1
@@ -185,19 +190,19 @@ def test_modes_of_codes():
 
 def test_a_model_whose_codes_never_change(model_file, drawn, tmp_path):
     """All its weights are zero: there is the mean shape alone."""
-    film = view.view_model(load_model(model_file), tmp_path / "f.png")
-    assert film.said.startswith("the mean shape and 0 modes") and has(drawn[0], LEFT) > 100
+    drawn_film = film_model.view_model(load_model(model_file), tmp_path / "f.png")
+    assert drawn_film.summary.startswith("the mean shape and 0 modes") and has(drawn[0], LEFT) > 100
 
 
 def test_persons_in_messages_of_their_own_come_together():
     times = np.array([0, 2, 33, 35, 66, 68]) * 1_000_000
-    chosen = view._with_company(times, times[[0, 4]])
+    chosen = film_excerpt._with_same_image(times, times[[0, 4]])
     assert chosen.tolist() == times[[0, 1, 4, 5]].tolist()
 
 
 @pytest.mark.parametrize("radius, spacing", [(1.0, 0.5), (0.4, 0.1), (3.9, 1.0), (30.0, 10.0), (0.004, 0.001)])
 def test_grid(radius, spacing):
-    assert view._spacing(radius) == pytest.approx(spacing)
+    assert film_stage._grid_spacing(radius) == pytest.approx(spacing)
 
 
 def test_other_formats_are_refused(tmp_path, capsys):
@@ -208,12 +213,12 @@ def test_other_formats_are_refused(tmp_path, capsys):
 def test_mp4_without_ffmpeg(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert cli.main(["view", "human", "-o", str(tmp_path / "film.mp4")]) == 1
-    assert "ffmpeg, which is not there; choose a name ending in .gif" in capsys.readouterr().err
+    assert "ffmpeg, which is missing; choose a name ending in .gif" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_mp4_by_ffmpeg(tmp_path, monkeypatch, fails):
-    """A stand-in that keeps what it is sent, under the name it is told last."""
+    """A stand-in that keeps what it is sent, under the name of its last argument."""
     program = tmp_path / "ffmpeg"
     keep = "import sys; open(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())"
     command = "echo no codec >&2; exit 3" if fails else f'exec {sys.executable} -c "{keep}" "$@"'
@@ -224,18 +229,18 @@ def test_mp4_by_ffmpeg(tmp_path, monkeypatch, fails):
     out = tmp_path / "films" / "film.mp4"
     if fails:
         with pytest.raises(PictureError, match="ffmpeg failed: no codec"):
-            view.write_film(out, iter(pictures))
+            write_film(out, iter(pictures))
         assert not out.exists()
     else:
-        view.write_film(out, iter(pictures))
+        write_film(out, iter(pictures))
         assert out.read_bytes() == b"".join(picture.tobytes() for picture in pictures)
     assert [path.name for path in out.parent.iterdir()] == ([] if fails else ["film.mp4"])
 
 
 def test_without_matplotlib(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["view", "human", "-o", str(tmp_path / "film.png")]) == 1
-    assert "matplotlib: pip install 'paul_ros[bags]'" in capsys.readouterr().err
+    assert "'matplotlib' is missing: pip install 'paul_ros[bags]'" in capsys.readouterr().err
 
 
 def test_the_bag_is_never_overwritten(tmp_path, capsys):
@@ -249,13 +254,13 @@ def test_the_bag_is_never_overwritten(tmp_path, capsys):
 def test_odd_times_are_refused(words, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(["view", "walk.mcap", *words])
-    assert end.value.code == 2 and "number of seconds" in capsys.readouterr().err
+    assert end.value.code == 2 and "no number of seconds" in capsys.readouterr().err
 
 
 def test_an_equal_bag_gives_an_equal_film(tmp_path, model_file):
     bag = make_bag(tmp_path / "walk.mcap", 4, rate=10)
     for name in ("a.gif", "b.gif"):
-        view.view_bag(bag, open_stream(str(model_file)), tmp_path / name)
+        film.view_bag(bag, open_stream(str(model_file)), tmp_path / name)
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
 
 
@@ -264,5 +269,5 @@ def test_lifted_points_fall_on_the_input(tmp_path, model_file):
 
     done = replay(make_bag(tmp_path / "walk.mcap", 1), open_stream(str(model_file)))
     frame = done.frames[0]
-    np.testing.assert_allclose(view._seen_by(frame), frame.keypoints.xy, atol=0.5)
+    np.testing.assert_allclose(film_stage._reprojected(frame), frame.keypoints.xy, atol=0.5)
     assert PERSON.shape == frame.lifted.points[0].shape

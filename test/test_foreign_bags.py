@@ -16,8 +16,10 @@ from paul_ros import cli
 from paul_ros.errors import BagError
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model_file import load_model
-from paul_ros.offline.bag import BagMessages, BagWriter, matches, read_records
+from paul_ros.model import load_model
+from paul_ros.offline.bag_reader import matches, read_records
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.replay import Topics, replay
 from paul_ros.stream.stream import LiftStream, open_stream
 
@@ -29,7 +31,7 @@ PIXELS = np.array([seen(persons_at((0.3 + 0.1 * n, 0, 4), (-1, 0.1, 5))) for n i
 
 
 class Factory(BagMessages):
-    """What bags are written with, the foreign packages included."""
+    """Return the factory that bags are written with, foreign packages included."""
 
     def __init__(self) -> None:
         super().__init__(foreign.DEFINITIONS)
@@ -170,8 +172,8 @@ def test_paul_replay_reads_it(tmp_path, model_file, name):
     bag, report = write(tmp_path / "in.mcap", name), tmp_path / "report.json"
     arguments = ["replay", bag, "--model", model_file, "--json", report, "--topic", topics_for(name).keypoints]
     assert cli.main([str(argument) for argument in arguments]) == 0
-    told = json.loads(report.read_text())
-    assert (told["frames"], told["persons"], told["dropped"], told["units"]) == (FRAMES, 2 * FRAMES, {}, "m")
+    found = json.loads(report.read_text())
+    assert (found["frames"], found["persons"], found["dropped"], found["units"]) == (FRAMES, 2 * FRAMES, {}, "m")
 
 
 def test_one_of_several_bodies(tmp_path, model_file):

@@ -244,7 +244,7 @@ def _bag_keypoints(
     path: Path, layout: Layout, topic: str | None
 ) -> tuple[dict[str, list[msg_adapters.Keypoints2D]], msg_adapters.Intrinsics | None, str]:
     """Keypoint messages by topic, the camera, and why messages were refused, the last of every topic."""
-    from paul_ros.offline.bag import matches, read_records  # needs the extra "bags"
+    from paul_ros.offline.bag_reader import matches, read_records
 
     camera, size, refused = _bag_camera(path)
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
@@ -268,7 +268,7 @@ def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, 
 
     Read before the keypoints: some are shares of the image, and the first of them may come before any CameraInfo.
     """
-    from paul_ros.offline.bag import read_records
+    from paul_ros.offline.bag_reader import read_records
 
     refused: dict[str, str] = {}
     cameras: set[msg_adapters.Intrinsics] = set()

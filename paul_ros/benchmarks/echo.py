@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The floor of `paul benchmark node`: what the obvious rclpy node pays to turn keypoints into poses without lifting.
+"""The baseline of `paul benchmark node`: a plain rclpy node that turns keypoints into poses without lifting.
 
-It is written as a tutorial would have it, on purpose: any price that it pays, a node in Python usually pays.
+It is written as a tutorial would write it, so that its cost is the usual cost of a node in Python.
 """
 
 from __future__ import annotations
 
 
 def main() -> None:
-    """`keypoints` (PointCloud2 of float32 x, y, confidence, person_id) in, ~/poses (PoseArray) out, until a signal."""
+    """Read `keypoints` (PointCloud2 of float32 x, y, confidence, person_id), publish ~/poses (PoseArray)."""
     import numpy as np
     import rclpy
     from geometry_msgs.msg import Pose, PoseArray

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The optimum by brute force, to judge solvers by: a search over rotations that knows no theory of the problem.
+"""The optimum by brute force: a search over rotations that uses no theory of the problem, to judge solvers by.
 
-It works on rotations from 24 starts spread over all of them, where ``paul_ros.onp`` works on viewing directions from
-starts in closed form; no formula and no line of code is common to both. Majorisation brings every start near its
-optimum, for it can only descend; as it converges slowly, damped Newton steps then finish the lowest of them.
+The search begins at 24 rotations spread over all of them. `paul_ros.onp` searches viewing directions from starts in
+closed form; the two share no formula and no line of code. Majorisation brings every start near its optimum, as it can
+only descend. It converges slowly, so damped Newton steps finish the lowest of them.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ import numpy as np
 from paul_ros.benchmarks.rivals import Centred, Pose, best_scale, centred, majorised, pose, spread_rotations
 
 STARTS = 24
-_MAJORISING = 100
-_POLISHED = 6  # of the starts
-_NEWTON = 12
+_MAJORISING = 100  # steps
+_POLISHED = 6  # starts that Newton steps finish
+_NEWTON = 12  # steps
 
 
 def naive_optimum(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str) -> Pose:
-    """The best pose found; arguments as in ``paul_ros.benchmarks.rivals``."""
+    """Return the best poses found; arguments as in `paul_ros.benchmarks.rivals`."""
     points = centred(S, W, weights)
     size = np.sqrt(points.A.trace(axis1=1, axis2=2))[:, None, None]
     image = np.sqrt((points.W**2 @ points.w[..., None]).sum(1))[..., None] if scale == "free" else size
-    # Without units: or else no damping would suit all.
+    # Made unitless, so that one damping suits all.
     unitless = points._replace(A=points.A / size**2, B=points.B / (size * image))
     R = _polished(unitless, _lowest(unitless, scale), scale)
     return pose(*best_scale(R[:, :2], points, scale), points)
 
 
 def _cost(Q: np.ndarray, A: np.ndarray, B: np.ndarray, scale: str) -> np.ndarray:
-    """(...) weighted mean of squared distances, less that of the image points, under the best scale."""
+    """Return the weighted mean squared distance (...) under the best scale, less that of the image points."""
     power, along = ((Q @ A) * Q).sum((-2, -1)), (Q * B).sum((-2, -1))
     return -(along**2) / power if scale == "free" else power - 2 * along
 
 
 def _lowest(points: Centred, scale: str) -> np.ndarray:
-    """(N,K,3,3) the rotations that majorisation from all starts brought lowest."""
+    """Return the lowest rotations (N,K,3,3) after majorisation from all starts."""
     N, starts = len(points.A), spread_rotations(STARTS)[:, :2]
     a, axes = np.linalg.eigh(points.A)
     axes = axes[:, None]
@@ -52,7 +52,7 @@ def _lowest(points: Centred, scale: str) -> np.ndarray:
 
 
 def _polished(points: Centred, R: np.ndarray, scale: str) -> np.ndarray:
-    """(N,3,3) the best of each problem's rotations (N,K,3,3) after Newton steps over rotation vectors and the scale."""
+    """Return each problem's best rotation (N,3,3) after Newton steps from its rotations (N,K,3,3)."""
     A, B = points.A[:, None], points.B[:, None]
     damping = np.full(R.shape[:2], 1e-3)
     cost = _cost(R[:, :, :2], A, B, scale)
@@ -68,12 +68,12 @@ def _polished(points: Centred, R: np.ndarray, scale: str) -> np.ndarray:
 
 
 def _derivatives(R: np.ndarray, A: np.ndarray, B: np.ndarray, scale: str) -> tuple[np.ndarray, np.ndarray]:
-    """Slope (...,3) and Hessian (...,3,3) of the cost in turns about the camera's axes."""
+    """Return the slope (...,3) and Hessian (...,3,3) of the cost for turns about the camera's axes."""
     power, power_slope, power_bend = _power(R @ A @ R.swapaxes(-1, -2))
     along, along_slope, along_bend = _along(B @ R.swapaxes(-1, -2))
     if scale == "unit":
         return power_slope - 2 * along_slope, power_bend - 2 * along_bend
-    # The cost is -along^2 / power; with the scale s = along / power:
+    # The cost is -along^2 / power, and the scale is s = along / power.
     s, over = (along / power)[..., None], 1 / power[..., None]
     scale_slope = (along_slope - s * power_slope) * over
     slope = s * s * power_slope - 2 * s * along_slope
@@ -83,7 +83,7 @@ def _derivatives(R: np.ndarray, A: np.ndarray, B: np.ndarray, scale: str) -> tup
 
 
 def _power(C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """tr(Q A Q^T), its slope and Hessian, from C = R A R^T: the trace less what lies along the view.
+    """Return tr(Q A Q^T), its slope and its Hessian, from C = R A R^T: the trace less the part along the view.
 
     To second order a turn v takes the view e3 to e3 + (-v1, v0, 0) + (v0 v2, v1 v2, -v0^2 - v1^2) / 2.
     """
@@ -96,7 +96,7 @@ def _power(C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _along(D: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """tr(Q B^T), its slope and Hessian, from D = B R^T (...,2,3).
+    """Return tr(Q B^T), its slope and its Hessian, from D = B R^T (...,2,3).
 
     To second order a turn v takes d to d + v x d + (v (v.d) - d |v|^2) / 2.
     """
@@ -109,7 +109,7 @@ def _along(D: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _turned(R: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """R turned by ``step`` (...,3), a rotation vector to second order (Cayley's map)."""
+    """Return R turned by `step` (...,3), a rotation vector to second order (Cayley's map)."""
     x, y, z = np.moveaxis(step / 2, -1, 0)
     rest = 1 - x * x - y * y - z * z
     rows = (

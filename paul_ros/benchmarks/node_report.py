@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `paul benchmark node` found, for people: a table to print, and a picture."""
+"""The report of `paul benchmark node` as a table of plain text, and as a picture."""
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from paul_ros.benchmarks import need
-from paul_ros.errors import PictureError
-from paul_ros.files import write_atomically
+from paul_ros.offline.figures import new_figure, save_figure
+from paul_ros.offline.report import cell
 
 _COLOURS = {"lifter": "#1f77d0", "echo": "#8a8a8a"}
-_LEAST_US = 100  # of the pictures' axes
+_MIN_US = 100  # where the axes of the picture begin
 _HEAD = (
     f"  {'persons':>7}{'Hz':>6}  {'node':<8}{'sent':>7}{'received':>9}{'median':>9}{'99 %':>9}{'CPU':>9}{'MB':>7}"
     f"{'x echo':>9}{'99 %':>7}{'+ CPU':>8}"
@@ -22,7 +20,7 @@ _HEAD = (
 
 
 def table(report: dict) -> str:
-    """The report as text: a line for each node, number of persons and rate; times in µs."""
+    """Return a report as text: a line for each node, number of persons and rate; times in µs."""
     ratios = {(ratio["persons"], ratio["rate_hz"]): ratio for ratio in report["ratios"]}
     lines = [_HEAD]
     for row in report["rows"]:
@@ -44,8 +42,8 @@ def table(report: dict) -> str:
 def _line(row: dict) -> str:
     return (
         f"  {row['persons']:>7}{row['rate_hz']:>6g}  {row['node']:<8}{row['sent']:>7}{row['received']:>9}"
-        f"{_cell(row['latency_median_us'], 9)}{_cell(row['latency_p99_us'], 9)}{_cell(row['cpu_us_per_frame'], 9)}"
-        f"{row['rss_mb']:>7.1f}"
+        f"{cell(row['latency_median_us'], 9, 0)}{cell(row['latency_p99_us'], 9, 0)}"
+        f"{cell(row['cpu_us_per_frame'], 9, 0)}{row['rss_mb']:>7.1f}"
     )
 
 
@@ -53,17 +51,13 @@ def _ratio_cells(ratio: dict | None) -> str:
     if ratio is None:
         return ""
     return (
-        f"{_cell(ratio['latency_median_ratio'], 9, 2)}{_cell(ratio['latency_p99_ratio'], 7, 2)}"
-        f"{_cell(ratio['cpu_added_us_per_frame'], 8)}"
+        f"{cell(ratio['latency_median_ratio'], 9, 2)}{cell(ratio['latency_p99_ratio'], 7, 2)}"
+        f"{cell(ratio['cpu_added_us_per_frame'], 8, 0)}"
     )
 
 
-def _cell(value: float | None, width: int, digits: int = 0) -> str:
-    return f"{'-':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
-
-
 def _soak_lines(soak: dict) -> list[str]:
-    """Memory at some twenty times, and whether it grows."""
+    """Return the memory at about twenty times, and its growth."""
     every = max(1, len(soak["memory"]) // 20)
     growth = soak["growth_mb_per_hour"]
     verdict = "too short to tell" if growth is None else f"{growth:+.2f} MB an hour in the second half"
@@ -79,16 +73,17 @@ def _soak_lines(soak: dict) -> list[str]:
 
 
 def write_picture(path: str | Path, report: dict) -> None:
-    """Bars of latency and CPU time for each number of persons and each rate; of a long run, its memory over time.
+    """Draw bars of latency and CPU time for each number of persons and each rate, or the memory of a long run.
 
-    The suffix of the path chooses the format. Raises ImportError without matplotlib, PictureError for an odd suffix.
+    Args:
+        path: the suffix chooses the format (.png, .svg, .pdf).
+        report: from `paul_ros.benchmarks.node`.
+
+    Raises:
+        MissingPackageError: matplotlib is not installed.
+        PictureError: matplotlib cannot write this format.
     """
-    need("matplotlib")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.5, 4.8), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(12.5, 4.8, extra="benchmark")
     if "soak" in report:
         _draw_memory(figure.subplots(), report)
     else:
@@ -101,16 +96,11 @@ def write_picture(path: str | Path, report: dict) -> None:
         figure.legend(handles, names, loc="outside lower center", ncols=2, frameon=False)
     for ax in figure.axes:
         ax.spines[["top", "right"]].set_visible(False)
-    buffer = io.BytesIO()
-    try:
-        figure.savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=110)
-    except ValueError as error:
-        raise PictureError(f"{path}: {error}") from error
-    write_atomically(path, buffer.getvalue())
+    save_figure(figure, path)
 
 
 def _draw_bars(ax: Any, rows: list[dict], key: str, tick: str | None = None) -> None:
-    """A bar a row in µs, the nodes side by side; a log scale, for ten persons are ten times one."""
+    """Draw a bar for each row in µs, the nodes side by side, on a log scale: ten persons cost ten times one."""
     cells = list(dict.fromkeys((row["persons"], row["rate_hz"]) for row in rows))
     for place, (name, colour) in enumerate(_COLOURS.items()):
         own = [row for row in rows if row["node"] == name and row[key] is not None]
@@ -121,11 +111,11 @@ def _draw_bars(ax: Any, rows: list[dict], key: str, tick: str | None = None) -> 
         if tick:
             ax.scatter(x, [row[tick] for row in own], marker="_", s=200, color=colour, zorder=3)
     ax.set_xticks(range(len(cells)), [f"{persons} at\n{rate:g} Hz" for persons, rate in cells], fontsize=9)
-    ax.set(yscale="log", ylim=(_LEAST_US, None), ylabel="µs a frame", xlabel="persons, rate")
+    ax.set(yscale="log", ylim=(_MIN_US, None), ylabel="µs a frame", xlabel="persons, rate")
 
 
 def _short(value: float) -> str:
-    """At most four characters for what fits a bar."""
+    """Return a number that fits into a bar."""
     return f"{value:.0f}" if value < 10_000 else f"{value / 1000:.0f}k"
 
 

@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `paul benchmark onp` found, for people: a table to print, and a picture."""
+"""The report of `paul benchmark onp` as a table of plain text, and as a picture."""
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from paul_ros.benchmarks import need
-from paul_ros.errors import PictureError
-from paul_ros.files import write_atomically
+from paul_ros.offline.figures import new_figure, save_figure
+from paul_ros.offline.report import cell
 
 _COLOURS = {"ours": "#111111", "lsq_svd": "#e4572e", "polar": "#f0a030", "majorise": "#1f77d0", "lm_search": "#2a9d50"}
-_LEAST_ANGLE = 1e-3  # degrees: what is shown of less
+_MIN_ANGLE = 1e-3  # degrees; smaller angles are drawn here
 _HEAD = (
     f"  {'method':<10}{'cases':>7}{'cert. %':>9}{'wrong':>6}{'missed':>8}{'better':>7}{'angle':>9}{'95 %':>9}"
     f"{'ratio':>8}{'worst':>9}{'µs':>9}{'x lsq':>7}{'µs batch':>10}{'x lsq':>7}"
@@ -22,7 +20,7 @@ _HEAD = (
 
 
 def table(report: dict) -> str:
-    """The report as text: scenario by scenario, the effect of noisy shapes, and what it all comes down to."""
+    """Return a report as text: each scenario, the effect of noisy shapes, and a summary."""
     by_scenario: dict[str, dict[str, dict]] = {}
     for row in report["rows"]:
         by_scenario.setdefault(row["scenario"], {})[row["method"]] = row
@@ -40,16 +38,12 @@ def _line(row: dict, lsq: dict) -> str:
     single, batch = row["us_single"], row["us_batch"]
     single_ratio, batch_ratio = single and single / lsq["us_single"], batch and batch / lsq["us_batch"]
     return (
-        f"  {row['method']:<10}{row['cases']:>7}{_cell(None if share is None else 100 * share, 9, 2)}"
-        f"{_cell(row['certified_wrong'], 6, 0)}{row['missed']:>8}{_cell(row['better_than_ours'], 7, 0)}"
+        f"  {row['method']:<10}{row['cases']:>7}{cell(None if share is None else 100 * share, 9, 2)}"
+        f"{cell(row['certified_wrong'], 6, 0)}{row['missed']:>8}{cell(row['better_than_ours'], 7, 0)}"
         f"{row['angle_median_deg']:>9.3f}{row['angle_p95_deg']:>9.3f}"
         f"{row['residual_ratio_median']:>8.4f}{row['residual_ratio_max']:>9.4g}"
-        f"{_cell(single, 9, 1)}{_cell(single_ratio, 7, 2)}{_cell(batch, 10, 2)}{_cell(batch_ratio, 7, 2)}"
+        f"{cell(single, 9, 1)}{cell(single_ratio, 7, 2)}{cell(batch, 10, 2)}{cell(batch_ratio, 7, 2)}"
     )
-
-
-def _cell(value: float | None, width: int, digits: int) -> str:
-    return f"{'-':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
 
 
 def _shape_lines(scenarios: dict[str, dict[str, dict]]) -> list[str]:
@@ -83,16 +77,17 @@ def _summary_lines(summary: dict) -> list[str]:
 
 
 def write_picture(path: str | Path, report: dict) -> None:
-    """Angles to the optimum by scenario, residual against time, and 3D error against hidden points.
+    """Draw angles to the optimum, residuals against times, and 3D errors against hidden points.
 
-    The suffix of the path chooses the format. Raises ImportError without matplotlib, PictureError for an odd suffix.
+    Args:
+        path: the suffix chooses the format (.png, .svg, .pdf).
+        report: from `paul_ros.benchmarks.onp`.
+
+    Raises:
+        MissingPackageError: matplotlib is not installed.
+        PictureError: matplotlib cannot write this format.
     """
-    need("matplotlib")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(15, 9), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(15, 9, extra="benchmark")
     left, right = figure.subfigures(1, 2, width_ratios=[1.35, 1])
     above, below = right.subplots(2, 1)
     _draw_angles(left.subplots(), report["rows"])
@@ -102,59 +97,54 @@ def write_picture(path: str | Path, report: dict) -> None:
     figure.legend(handles, names, loc="outside upper center", ncols=len(names), frameon=False, fontsize=11)
     for ax in figure.axes:
         ax.spines[["top", "right"]].set_visible(False)
-    buffer = io.BytesIO()
-    try:
-        figure.savefig(buffer, format=Path(path).suffix.lstrip(".") or "png", dpi=110)
-    except ValueError as error:
-        raise PictureError(f"{path}: {error}") from error
-    write_atomically(path, buffer.getvalue())
+    save_figure(figure, path)
 
 
-def _of(rows: list[dict], method: str, key: str) -> list[dict]:
+def _rows_with(rows: list[dict], method: str, key: str) -> list[dict]:
     return [row for row in rows if row["method"] == method and row[key] is not None]
 
 
 def _draw_angles(ax: Any, rows: list[dict]) -> None:
-    """A line a method from the median to the 95th percentile of the angle, scenario by scenario."""
+    """Draw a line for each method and scenario, from the median angle to its 95th percentile."""
     for place, (name, colour) in enumerate(_COLOURS.items()):
-        own = _of(rows, name, "us_single")
+        own = _rows_with(rows, name, "us_single")
         y = np.arange(len(own)) + 0.15 * (place - 2)
-        low, high = (
-            np.maximum([row[key] for row in own], _LEAST_ANGLE) for key in ("angle_median_deg", "angle_p95_deg")
-        )
+        low, high = (np.maximum([row[key] for row in own], _MIN_ANGLE) for key in ("angle_median_deg", "angle_p95_deg"))
         ax.hlines(y, low, high, color=colour, linewidth=1.6)
         ax.scatter(low, y, color=colour, s=26, zorder=3)
         ax.scatter(high, y, color=colour, s=30, marker="|", zorder=3)
-    titles = [row["scenario"] for row in _of(rows, "ours", "us_single")]
+    titles = [row["scenario"] for row in _rows_with(rows, "ours", "us_single")]
     ax.set_yticks(range(len(titles)), titles, fontsize=9)
-    ax.set(xscale="log", ylim=(len(titles) - 0.5, -0.5), xlim=(0.7 * _LEAST_ANGLE, 200))
+    ax.set(xscale="log", ylim=(len(titles) - 0.5, -0.5), xlim=(0.7 * _MIN_ANGLE, 200))
     ax.set_xlabel(
-        f"degrees to the optimum: dot the median, tick the 95th percentile; {_LEAST_ANGLE} stands for less too"
+        f"degrees to the optimum: dot the median, tick the 95th percentile; smaller angles are drawn at {_MIN_ANGLE}"
     )
     ax.set_title("Angle to the optimum", loc="left", fontweight="bold")
-    ax.hlines(np.arange(len(titles) - 1) + 0.5, 0.7 * _LEAST_ANGLE, 200, color="#eeeeee", linewidth=0.8, zorder=0)
+    ax.hlines(np.arange(len(titles) - 1) + 0.5, 0.7 * _MIN_ANGLE, 200, color="#eeeeee", linewidth=0.8, zorder=0)
 
 
 def _draw_times(ax: Any, rows: list[dict]) -> None:
-    """A dot a scenario: time of one pose alone and, hollow, in a batch, against the median residual."""
+    """Draw a dot for each scenario, time against median residual: filled for one pose alone, hollow in a batch."""
     for name, colour in _COLOURS.items():
         for key, face in (("us_single", colour), ("us_batch", "white")):
-            own = _of(rows, name, key)
+            own = _rows_with(rows, name, key)
             place = [row[key] for row in own], [row["residual_ratio_median"] for row in own]
             label = name if key == "us_single" else None
             ax.scatter(*place, s=26, edgecolors=colour, facecolors=face, linewidths=1.2, label=label, alpha=0.7)
     ax.set(
-        xscale="log", xlabel="µs a pose: full dots alone, hollow dots in a batch", ylabel="residual over the optimum's"
+        xscale="log",
+        xlabel="µs a pose: full dots alone, hollow dots in a batch",
+        ylabel="residual over that of the optimum",
     )
-    ax.set_title("What the residual costs (a dot a scenario, the median)", loc="left", fontweight="bold")
+    ax.set_title("Time against residual (a dot for each scenario, the median)", loc="left", fontweight="bold")
     ax.axhline(1, color="#dddddd", zorder=0)
 
 
 def _draw_shape_errors(ax: Any, rows: list[dict]) -> None:
-    """Bars of the methods that solved all cases, scenario by scenario."""
-    titles = [row["scenario"] for row in _of(rows, "ours", "ne_percent")]
+    """Draw bars of the methods that solved all cases, for each scenario."""
+    titles = [row["scenario"] for row in _rows_with(rows, "ours", "ne_percent")]
     for place, name in enumerate(name for name in _COLOURS if name != "lm_search"):
-        heights = [row["ne_percent"] for row in _of(rows, name, "ne_percent")]
+        heights = [row["ne_percent"] for row in _rows_with(rows, name, "ne_percent")]
         ax.bar(np.arange(len(titles)) + 0.2 * (place - 1.5), heights, 0.18, color=_COLOURS[name])
     labels = [title.replace("20 % shape noise, ", "").replace(", ", ",\n") for title in titles]
     ax.set_xticks(range(len(titles)), labels, fontsize=9)

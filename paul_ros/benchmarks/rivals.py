@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other ways to solve orthographic-N-point, each as fast as plain batched numpy lets it be.
+"""Rival solvers of the orthographic-N-point problem, each as fast as plain batched numpy allows.
 
-All have one face: ``method(S (N,3,P), W (N,2,P), weights (N,P) or None, scale) -> Pose``; ``scale`` is ``"free"`` or
-``"unit"``. A point of weight 0 is hidden; its numbers must be finite all the same. None of them flags degenerate input.
-Nothing here is shared with ``paul_ros.onp``, which is judged by it.
+All have the signature `method(S (N,3,P), W (N,2,P), weights (N,P) or None, scale) -> Pose`, where `scale` is 'free' or
+'unit'. A point of weight 0 is hidden, but its coordinates must be finite. No method flags degenerate input. Nothing is
+shared with `paul_ros.onp`, which is compared with these.
 """
 
 from __future__ import annotations
@@ -15,15 +15,13 @@ import numpy as np
 
 _TINY = 1e-300
 _RIDGE = 1e-14
-_RANK_ONE = 1e-12  # of a 2x3 matrix' larger singular value: a smaller one leaves its polar factor undetermined
-
-
-_PLANAR = 1e-10  # of the largest eigenvalue of A: the smallest of a planar shape is less
+_RANK_ONE = 1e-12  # least second singular value of a 2x3 matrix with a polar factor, over the first
+_PLANAR = 1e-10  # largest third eigenvalue of A of a planar shape, over the first
 _TILT = np.array([[0.8, 0.48, -0.36], [0.0, 0.6, 0.8], [0.6, -0.64, 0.48]])  # a turn away from all axes
 
 
 class Pose(NamedTuple):
-    """``W ~ scale * R[:, :2] @ S + translation``, for N problems.
+    """Poses of N problems: W ~ scale * R[:, :2] @ S + translation.
 
     Attributes:
         R: (N,3,3) rotations, canonical frame to camera frame, det +1.
@@ -39,9 +37,16 @@ class Pose(NamedTuple):
 
 
 class Centred(NamedTuple):
-    """Shapes S (N,3,P) and image points W (N,2,P) about their weighted means, and weights w (N,P) of sum 1.
+    """N problems about their weighted means, with their moments.
 
-    A = S w S^T (N,3,3) and B = W w S^T (N,2,3) are their moments.
+    Attributes:
+        S: (N,3,P) shapes.
+        W: (N,2,P) image points.
+        w: (N,P) weights of sum 1.
+        S_mean: (N,3,1) mean that was taken from S.
+        W_mean: (N,2,1) mean that was taken from W.
+        A: (N,3,3) moments S w S^T.
+        B: (N,2,3) moments W w S^T.
     """
 
     S: np.ndarray
@@ -54,7 +59,7 @@ class Centred(NamedTuple):
 
 
 def centred(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> Centred:
-    """What every method starts with."""
+    """Return problems about their means, with which every method begins."""
     S, W = np.asarray(S, float), np.asarray(W, float)
     w = np.ones((len(S), S.shape[2])) if weights is None else np.asarray(weights, float)
     w = w / w.sum(1, keepdims=True)
@@ -65,7 +70,7 @@ def centred(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None) -> Centred
 
 
 def pose(Q: np.ndarray, scale: np.ndarray, points: Centred) -> Pose:
-    """The pose of the first two rows Q (N,2,3) of rotations: third row by cross product, best translation."""
+    """Return the poses of rotations given by their first two rows Q (N,2,3), with the best translations."""
     x, y = Q[:, 0], Q[:, 1]
     z = x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]
     camera = scale[:, None, None] * Q
@@ -76,7 +81,7 @@ def pose(Q: np.ndarray, scale: np.ndarray, points: Centred) -> Pose:
 
 
 def best_scale(Q: np.ndarray, points: Centred, scale: str) -> tuple[np.ndarray, np.ndarray]:
-    """Q and its least-squares scale (N,); Q turned by half a turn in the image where that would be negative."""
+    """Return Q and its least-squares scale (N,); Q is turned by 180 degrees in the image where that is negative."""
     if scale == "unit":
         return Q, np.ones(len(Q))
     along, power = (Q * points.B).sum((1, 2)), ((Q @ points.A) * Q).sum((1, 2))
@@ -84,10 +89,10 @@ def best_scale(Q: np.ndarray, points: Centred, scale: str) -> tuple[np.ndarray, 
 
 
 def _affine(points: Centred) -> np.ndarray:
-    """Least-squares affine cameras M = W S^+ (N,2,3).
+    """Return least-squares affine cameras M = W S^+ (N,2,3).
 
-    Of the many cameras of a flat shape in a plane of its axes the smallest; a flat shape that lies askew is flat only
-    up to rounding, and so is the answer then.
+    A flat shape in a plane of its axes has many; the smallest is returned. An oblique flat shape is flat only up to
+    rounding, and so is its camera.
     """
     B = points.B.transpose(0, 2, 1)
     try:
@@ -103,9 +108,9 @@ def _lsq_svd(points: Centred) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lsq_svd(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str) -> Pose:
-    """Least squares, then SVD: the algebraic solver of PAUL (Wang and Lucey, CVPR 2021, section 4).
+    """Solve by least squares, then SVD: the algebraic solver of PAUL (Wang and Lucey, CVPR 2021, section 4).
 
-    The least-squares affine camera with its singular values set to one; in the free-scale problem to their mean.
+    The singular values of the least-squares affine camera are set to one, in the free-scale problem to their mean.
     """
     points = centred(S, W, weights)
     Q, singular = _lsq_svd(points)
@@ -113,12 +118,12 @@ def lsq_svd(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str
 
 
 def polar(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str) -> Pose:
-    """Affine fit for the viewing direction, orthogonal polar factor for the rest.
+    """Solve by an affine fit for the viewing direction and a polar factor for the rest.
 
-    The polar factor of the affine camera itself is what ``lsq_svd`` gives, and Gram-Schmidt (QR) of its rows is worse
-    than that at every noise. So this is the strongest closed form of the kind we know: the viewing direction n across
-    the rows of the affine camera, then orthogonal Procrustes (Schoenemann, Psychometrika 1966) in the plane across n,
-    that is the polar factor of B (I - n n^T), which is the best pose that looks along n; and the least-squares scale.
+    The viewing direction n is normal to the rows of the affine camera. The best pose that looks along n is the polar
+    factor of B (I - n n^T): orthogonal Procrustes (Schoenemann, Psychometrika 1966) in the plane across n. The scale
+    is that of least squares. We know no stronger closed form of its kind. The polar factor of the affine camera itself
+    is `lsq_svd`, and Gram-Schmidt (QR) of its rows is worse than that at every noise.
     """
     points = centred(S, W, weights)
     x, y = _affine(points).transpose(1, 2, 0)
@@ -130,12 +135,12 @@ def polar(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str) 
 
 
 def majorise(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str, steps: int = 200) -> Pose:
-    """Majorisation: 200 polar factors from the answer of ``lsq_svd``.
+    """Solve by majorisation from the pose of `lsq_svd`, 200 steps by default.
 
-    Kiers (Psychometrika 1990) and ten Berge (Least squares optimization in multivariate analysis, 1993): with alpha
-    the largest eigenvalue of A, Q <- polar factor of B - Q (A - alpha I) never raises the cost. In the free-scale
-    problem Q takes turns with its least-squares scale. The ``lsq_svd`` of a planar shape looks straight at it, and no
-    step would lead away from there; so that is tilted first.
+    With alpha the largest eigenvalue of A, the step Q <- polar factor of B - Q (A - alpha I) never raises the cost.
+    Sources: Kiers (Psychometrika 1990), ten Berge (Least squares optimization in multivariate analysis, 1993). In the
+    free-scale problem, Q and its least-squares scale are updated in turns. The `lsq_svd` of a planar shape looks
+    straight at it, where no step moves it, so it is tilted first.
     """
     points = centred(S, W, weights)
     Q = _lsq_svd(points)[0]
@@ -145,12 +150,12 @@ def majorise(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: st
     to_axes = (part @ axes for part in (points.B, Q))
     B, Q = (np.ascontiguousarray(part.transpose(1, 2, 0)) for part in to_axes)
     Q = majorised(a.T.copy(), B, Q, scale, steps).transpose(2, 0, 1) @ axes.transpose(0, 2, 1)
-    U, _, Vt = np.linalg.svd(Q, full_matrices=False)  # what rounding took from the rows' right angle
+    U, _, Vt = np.linalg.svd(Q, full_matrices=False)  # rounding has made the rows oblique
     return pose(*best_scale(U @ Vt, points, scale), points)
 
 
 def majorised(a: np.ndarray, B: np.ndarray, Q: np.ndarray, scale: str, steps: int) -> np.ndarray:
-    """Q (2,3,N) after so many steps, all in the axes of A, whose eigenvalues are a (3,N); B (2,3,N)."""
+    """Return Q (2,3,N) after some steps; Q and B (2,3,N) are in the axes of A, whose eigenvalues are a (3,N)."""
     gap = a.max(0) - a
     for _ in range(steps):
         pull = gap
@@ -161,9 +166,9 @@ def majorised(a: np.ndarray, B: np.ndarray, Q: np.ndarray, scale: str, steps: in
 
 
 def _polar_factor(M: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """(M M^T)^(-1/2) M of M (2,3,N), in closed form; ``otherwise`` where M has not full rank.
+    """Return (M M^T)^(-1/2) M of M (2,3,N) in closed form, and `otherwise` where M lacks full rank.
 
-    The square root of a 2x3 problem's G = M M^T is (G + sqrt(det G)) / sqrt(tr G + 2 sqrt(det G)).
+    The square root of the 2x2 matrix G = M M^T is (G + sqrt(det G)) / sqrt(tr G + 2 sqrt(det G)).
     """
     x, y = M
     g, h, c = (x * x).sum(0), (y * y).sum(0), (x * y).sum(0)
@@ -175,10 +180,10 @@ def _polar_factor(M: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
 
 
 def lm_search(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None, scale: str, starts: int = 8) -> Pose:
-    """Levenberg-Marquardt (MINPACK, by ``scipy.optimize.least_squares``) from spread rotations; the best.
+    """Solve by Levenberg-Marquardt from spread rotations (MINPACK, by `scipy.optimize.least_squares`); keep the best.
 
-    Unknowns are a rotation vector and, in the free-scale problem, the logarithm of the scale, which starts at the ratio
-    of the points' sizes; the Jacobian is analytic, and centring takes the translation out.
+    The unknowns are a rotation vector and, in the free-scale problem, the logarithm of the scale. The scale starts at
+    the ratio of the points' sizes. The Jacobian is analytic, and centring removes the translation.
     """
     points = centred(S, W, weights)
     first = [_rotation_vector(q) for q in _spread_quaternions(starts)]
@@ -213,7 +218,7 @@ def _lm(S: np.ndarray, W: np.ndarray, root_w: np.ndarray, starts: list, scale: s
 
 
 def _rotation(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3,3) of a rotation vector, and its left Jacobian: exp(x + dx) = exp(J dx) exp(x)."""
+    """Return the rotation (3,3) of a rotation vector, and its left Jacobian J: exp(x + dx) = exp(J dx) exp(x)."""
     a, b, c = x[:3].tolist()
     square = a * a + b * b + c * c
     angle = math.sqrt(square)
@@ -228,12 +233,12 @@ def _rotation(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spread_rotations(count: int) -> np.ndarray:
-    """(count,3,3) rotations, nearly even over all there are."""
+    """Return rotations (count,3,3), spread nearly evenly over all rotations."""
     return np.array([_rotation(_rotation_vector(q))[0] for q in _spread_quaternions(count)])
 
 
 def _spread_quaternions(count: int) -> np.ndarray:
-    """(count,4) unit quaternions x, y, z, w: super-Fibonacci spirals (Alexa, CVPR 2022)."""
+    """Return unit quaternions x, y, z, w (count,4) on super-Fibonacci spirals (Alexa, CVPR 2022)."""
     i = np.arange(count) + 0.5
     near, far = np.sqrt(i / count), np.sqrt(1 - i / count)
     one, two = 2 * np.pi * i / math.sqrt(2), 2 * np.pi * i / 1.533751168755204288118041

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two ends of `paul benchmark node`, each a process of its own.
+"""The publisher and the listener of `paul benchmark node`, each a process of its own.
 
-`python -m paul_ros.benchmarks.traffic publish` is told what to send by lines of JSON on stdin and answers each with
-one; `... listen` writes a record of three numbers to stdout for every message that a node answers with. Both handle
-serialised bytes only, so that little of what is measured is their own.
+`python -m paul_ros.benchmarks.traffic publish` reads commands from stdin, a line of JSON each, and answers each with
+one line. `... listen` writes one ARRIVAL to stdout for every output of a node. Both handle serialised bytes only, to
+add little to what is measured.
 """
 
 from __future__ import annotations
@@ -16,28 +16,34 @@ import sys
 import time
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+#: Names of the measured nodes, which read /NAME/keypoints and publish /NAME/poses.
 NODES = ("lifter", "echo")
-"""A node of this name reads /NAME/keypoints and publishes /NAME/poses."""
-ARRIVAL = np.dtype([("node", "<i8"), ("stamp", "<i8"), ("arrival", "<i8")])
-"""What the listener writes: index in NODES, header.stamp of the answer and when it came, ns of the system's clock."""
 
-#: Little-endian CDR begins with four bytes of its own; a message with a header begins with the stamp.
+#: Record of the listener: index in NODES (-1 = ready), header.stamp of the output, and time of its arrival, both in ns.
+ARRIVAL = np.dtype([("node", "<i8"), ("stamp", "<i8"), ("arrival", "<i8")])
+
+#: The stamp follows the four bytes that begin CDR, in a message that begins with a header.
 _STAMP = struct.Struct("<iI")
 _STAMP_AT = 4
 _SECOND = 10**9
 
 
 def publish() -> None:
-    """Says {} when it is ready, then sends keypoints until stdin closes.
+    """Answer {} when ready, then obey commands until stdin closes.
 
-    A command has `node`, `messages` (.npy of serialised clouds, (K,L) uint8, sent in turn), `rate_hz` and `count`; null
-    for until the next line comes, which may be empty. Every message gets the time of its sending as stamp. With a count
-    it waits until the node has subscribed. The answer is {sent, first, last}: how many, the first and the last stamp.
-    A command with `camera_info` (.npy of one serialised message) sends that to the lifter until it says that it knows
-    the camera.
+    A command to send keypoints has these keys, and the answer is {sent, first, last}: a count and two stamps in ns.
+
+    - node: one of NODES.
+    - messages: .npy file of serialised clouds, (K,L) uint8, sent in turn, each stamped with the time of its sending.
+    - rate_hz: rate of the messages.
+    - count: number of messages, sent once the node has subscribed; null = until the next line, which may be empty.
+
+    A command with `camera_info`, the .npy file of one serialised message, sends that to the lifter until its output is
+    in metres.
     """
     import rclpy
     from sensor_msgs.msg import CameraInfo, PointCloud2
@@ -50,7 +56,7 @@ def publish() -> None:
     for line in _lines():
         command = json.loads(line)
         if "camera_info" in command:
-            _tell_camera(node, camera, np.load(command["camera_info"])[0].tobytes())
+            _send_camera(node, camera, np.load(command["camera_info"])[0].tobytes())
             answer = {}
         else:
             messages = [bytearray(row.tobytes()) for row in np.load(command["messages"])]
@@ -60,18 +66,18 @@ def publish() -> None:
 
 
 def _lines() -> Iterator[str]:
-    """Lines of stdin, read without a buffer, so that select() tells truly whether there is one more."""
+    """Yield the lines of stdin, read without a buffer so that select() sees whether one more is there."""
     kept = b""
     while data := os.read(0, 4096):
         *lines, kept = (kept + data).split(b"\n")
         yield from (line.decode() for line in lines if line.strip())
 
 
-def _send(publisher, messages: list[bytearray], rate: float, count: int | None) -> dict:
+def _send(publisher: Any, messages: list[bytearray], rate: float, count: int | None) -> dict:
     while count and not publisher.get_subscription_count():
         time.sleep(0.01)
     began, sent, first, stamp = time.monotonic(), 0, 0, 0
-    while sent != count and (count or not _told_to_stop()):
+    while sent != count and (count or not _next_line_waits()):
         time.sleep(max(0.0, began + sent / rate - time.monotonic()))
         message = messages[sent % len(messages)]
         stamp = time.time_ns()
@@ -81,12 +87,12 @@ def _send(publisher, messages: list[bytearray], rate: float, count: int | None) 
     return {"sent": sent, "first": first, "last": stamp}
 
 
-def _told_to_stop() -> bool:
+def _next_line_waits() -> bool:
     return bool(select.select([0], [], [], 0)[0])
 
 
-def _tell_camera(node, publisher, message: bytes) -> None:
-    """CameraInfo is sent again until ~/layout says that the output is in metres: a first one may come too early."""
+def _send_camera(node: Any, publisher: Any, message: bytes) -> None:
+    """Send CameraInfo until ~/layout shows metres: the node may not have matched the first one yet."""
     import rclpy
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from std_msgs.msg import String
@@ -104,7 +110,7 @@ def _tell_camera(node, publisher, message: bytes) -> None:
 
 
 def listen() -> None:
-    """Writes an ARRIVAL for every message of the nodes, until a signal; one of no node when it is ready."""
+    """Write an ARRIVAL of node -1 when ready, then one for every output of the nodes, until a signal."""
     import rclpy
     from geometry_msgs.msg import PoseArray
     from rclpy.executors import ExternalShutdownException

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a model file, a bag or a layout holds, as one summary for people and for JSON."""
+"""Summaries of model files, bags and layouts, for people and for JSON."""
 
 from __future__ import annotations
 
@@ -7,15 +7,22 @@ from pathlib import Path
 
 from paul_ros.errors import BagError
 from paul_ros.layout import Layout, layout_names, load_layout
-from paul_ros.model_file import load_model, model_names
-from paul_ros.offline.bag import read_records
+from paul_ros.model import load_model, model_names
+from paul_ros.offline.bag_reader import read_records
 
 
 def inspect(thing: str) -> tuple[dict, BagError | None]:
-    """The summary of a model, bag or layout, given by name or path; with a damaged bag also what is wrong with it.
+    """Summarise a model, a bag or a layout.
 
-    Of a shipped model whose name a layout has too, as `human`, the layout's stands in the model's.
-    Raises BagError, LayoutError or ModelError.
+    Args:
+        thing: name of a shipped model or layout, or a path: .npz model, .yaml layout, .mcap file or rosbag2 folder.
+            A name that a model and a layout share, as `human`, gives the model's summary with the layout's in it.
+
+    Returns:
+        The summary, and the error of a damaged bag, of which the messages before the damage are counted.
+
+    Raises:
+        BagError, LayoutError, ModelError: it cannot be read.
     """
     path = Path(thing)
     if path.is_dir() or path.suffix in (".mcap", ".part"):
@@ -74,7 +81,7 @@ def _model(thing: str) -> dict:
 
 
 def as_text(summary: dict) -> str:
-    """`key  value` lines; what is nested is indented, long lists are wrapped by the terminal."""
+    """Return a summary as `key  value` lines, nested parts indented; the terminal wraps long lists."""
     return "\n".join(_lines(summary, ""))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes that speak ROS 2, for the demo and the benchmark of the node; only this machine hears them."""
+"""Child processes with ROS 2 nodes, for the demo and the benchmark of the node; no other machine can see them."""
 
 from __future__ import annotations
 
@@ -10,32 +10,41 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-_PATIENCE = 30.0  # seconds for a process to end
-_LAST_PATIENCE = 5.0  # after which it is killed
+from paul_ros.errors import MissingPackageError
+
+_END_TIMEOUT = 30.0  # seconds for a process to end by itself
+_TERMINATE_TIMEOUT = 5.0  # seconds after SIGTERM until it is killed
 
 
 def need_ros(what: str) -> None:
-    """Raises ImportError, with a text for the user, where there is no rclpy; sets what must be set before it loads."""
-    # Before the middleware loads: only this machine, and the one middleware that PyPI has.
+    """Check that ROS 2 is installed, and choose the middleware before it loads.
+
+    Args:
+        what: subject of the error, as 'the demo'.
+
+    Raises:
+        MissingPackageError: there is no rclpy.
+    """
+    # Only this machine, and the one middleware that PyPI has.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
-        raise ImportError(
+        raise MissingPackageError(
             f"{what} needs ROS 2: source /opt/ros/jazzy/setup.bash, or pip install 'paul_ros[ros]'"
         ) from error
 
 
 def ros_environment() -> dict[str, str]:
-    """For the children: a ROS domain of this run's own, and the same paul_ros as here."""
+    """Return the environment of the children: a ROS domain of this run's own, and the same paul_ros as here."""
     package = str(Path(__file__).resolve().parent.parent.parent)
     paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
-    # 1..100: higher domains may meet the ports that Linux hands out.
     return {
         **os.environ,
+        # 1 to 100: the ports of higher domains can collide with those that Linux hands out.
         "ROS_DOMAIN_ID": str(1 + (os.getpid() + 50) % 100),
         "PYTHONPATH": os.pathsep.join(paths),
         "PYTHONSAFEPATH": "1",
@@ -45,13 +54,17 @@ def ros_environment() -> dict[str, str]:
 
 @contextlib.contextmanager
 def process(
-    arguments: Sequence[str], environment: dict[str, str], log: Any, stdout: Any = None
+    arguments: Sequence[str], environment: dict[str, str], log: BinaryIO, stdout: Any = None
 ) -> Iterator[subprocess.Popen]:
-    """A Python module as a child process; ended, if it still runs, with the block.
+    """Run a Python module as a child process during the block, then end it if it still runs.
 
-    log: a file for what it says, on stdout too unless `stdout` is another place for that.
+    Args:
+        arguments: the module and its arguments.
+        environment: environment variables of the child.
+        log: file for stderr, and for stdout unless that is given.
+        stdout: another place for stdout, as for subprocess.Popen.
     """
-    with _no_interrupt() as interrupted:  # in the midst of this nobody would know the child's id yet
+    with _deferred_interrupt() as interrupted:  # an interrupt in here would lose the child's id
         child = subprocess.Popen(
             [sys.executable, "-m", *arguments],
             env=environment,
@@ -59,13 +72,14 @@ def process(
             stdout=log if stdout is None else stdout,
             stderr=log,
         )
+    assert child.stdin
     try:
         if interrupted:
             raise KeyboardInterrupt
         yield child
-        child.stdin.close()  # the player's sign to leave
+        child.stdin.close()  # tells the player to leave
         with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(_PATIENCE)
+            child.wait(_END_TIMEOUT)
     finally:
         with contextlib.suppress(BrokenPipeError):
             child.stdin.close()
@@ -73,10 +87,10 @@ def process(
 
 
 @contextlib.contextmanager
-def _no_interrupt() -> Iterator[list]:
-    """Ctrl-C raises nothing within the block; the list that is given then holds something."""
+def _deferred_interrupt() -> Iterator[list]:
+    """Record SIGINT during the block instead of raising; the list it yields is then not empty."""
     interrupted: list = []
-    before = signal.signal(signal.SIGINT, lambda *signalled: interrupted.append(signalled))
+    before = signal.signal(signal.SIGINT, lambda *arguments: interrupted.append(arguments))
     try:
         yield interrupted
     finally:
@@ -84,25 +98,25 @@ def _no_interrupt() -> Iterator[list]:
 
 
 def _end(child: subprocess.Popen) -> None:
-    """Asks first, since a process that is killed leaves the middleware's shared memory behind."""
+    """Terminate a process, and kill it only if it does not react: a kill leaks the middleware's shared memory."""
     if child.poll() is None:
         child.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(_LAST_PATIENCE)
+            child.wait(_TERMINATE_TIMEOUT)
     if child.poll() is None:
         child.kill()
         child.wait()
 
 
-def tail(log: Any) -> str:
-    """The last lines of a log file, as one."""
+def tail(log: BinaryIO) -> str:
+    """Return the last three lines of a log file as one line."""
     log.seek(0)
     lines = log.read().decode(errors="replace").strip().splitlines()
-    return " / ".join(lines[-3:]) or "it said nothing"
+    return " / ".join(lines[-3:]) or "its log is empty"
 
 
 def rss_mb(pid: int) -> float:
-    """Resident memory of a process now."""
+    """Return the resident memory of a process in MB; NaN for a process that has ended."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024

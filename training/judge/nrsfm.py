@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.offline.replay import versions
+from paul_ros.versions import versions
 from training.errors import DataError
 from training.judge.experiments import BAD_BASIN, Keeping, Outcome, Run, chosen, groups, perform, summary
 from training.judge.pictures import legend_above, method_look, new_figure, percent_axis, save_figure, titled

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.benchmarks import need
 from paul_ros.errors import PictureError
+from paul_ros.extras import require
 from paul_ros.files import write_atomically
 
 COLOURS = ("#1f77d0", "#e4572e", "#2a9d50", "#f0a030", "#8458b3", "#444444", "#17a2b8", "#c2185b")
@@ -40,7 +40,7 @@ def method_look(method: str) -> tuple[str, str]:
 
 def new_figure(width: float, height: float) -> Any:
     """A figure of so many inches. Raises ImportError, with a text for the user, without matplotlib."""
-    need("matplotlib")
+    require("benchmark", "matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bag messages: serialised records, and messages decoded or made from their definitions, without ROS.
+
+`rosbags` does the work; it comes with the extra `bags` and is imported when the first message is decoded or made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from paul_ros.errors import BagError
+from paul_ros.extras import require
+
+
+@dataclass(frozen=True)
+class Record:
+    """One serialised message of a bag, with the definition that explains its bytes.
+
+    Attributes:
+        topic: name of the topic.
+        type_name: ROS type, as 'sensor_msgs/msg/PointCloud2'.
+        data: CDR with its 4-byte encapsulation header.
+        log_time: nanoseconds.
+        definition: text of the type and of all types it contains; '' = the definition of ROS 2 Jazzy.
+        encoding: language of the definition, 'ros2msg' or 'ros2idl'.
+        qos: offered QoS profiles in the YAML of rosbag2; '' = not recorded.
+    """
+
+    topic: str
+    type_name: str
+    data: bytes
+    log_time: int
+    definition: str = ""
+    encoding: str = "ros2msg"
+    qos: str = ""
+
+    def message(self) -> Any:
+        """Return the decoded message, a dataclass with the field names of the rclpy message.
+
+        Raises:
+            BagError: the bytes do not fit the definition, or the definition cannot be read.
+        """
+        try:
+            return _typestore(self.type_name, self.definition, self.encoding).deserialize_cdr(self.data, self.type_name)
+        except BagError:
+            raise
+        except Exception as error:  # rosbags raises many kinds for bytes that do not fit their definition
+            raise BagError(f"a {self.type_name} message on {self.topic} does not decode: {error}") from error
+
+
+class BagMessages:
+    """A message factory for the writers of `msg_adapters`: make(type_name, **every_field) returns a dataclass."""
+
+    def __init__(self, definitions: dict[str, str] | None = None) -> None:
+        """Load the message types of ROS 2 Jazzy.
+
+        Args:
+            definitions: type name -> text of its .msg file, for types that Jazzy's standard messages lack.
+        """
+        self._store = jazzy_typestore()
+        if definitions:
+            from rosbags.typesys import get_types_from_msg
+
+            self._store = _new_jazzy_typestore()  # the shared one must not learn these types
+            for name, text in definitions.items():
+                self._store.register(get_types_from_msg(text, name))
+
+    def __call__(self, type_name: str, **fields: Any) -> Any:
+        return self._store.types[type_name](**fields)
+
+    @staticmethod
+    def octets(data: bytes) -> Any:
+        """Return bytes as the array that a uint8[] field holds."""
+        import numpy as np
+
+        return np.frombuffer(data, np.uint8)
+
+    def serialise(self, message: Any) -> bytes:
+        """Return a message as little-endian CDR."""
+        return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
+
+    def definition(self, type_name: str) -> str:
+        """Return the ros2msg text of a type and of all types it contains."""
+        return self._store.generate_msgdef(type_name, ros_version=2)[0]
+
+
+def _new_jazzy_typestore() -> Any:
+    require("bags", "rosbags")
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@lru_cache(maxsize=1)
+def jazzy_typestore() -> Any:
+    """Return the shared rosbags typestore of ROS 2 Jazzy."""
+    return _new_jazzy_typestore()
+
+
+@lru_cache(maxsize=256)
+def _typestore(type_name: str, definition: str, encoding: str) -> Any:
+    """Return a typestore for one definition: two bags may define a type of one name differently."""
+    if not definition:
+        return jazzy_typestore()
+    require("bags", "rosbags")
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    if encoding == "ros2msg":
+        store.register(get_types_from_msg(definition, type_name))
+    elif encoding == "ros2idl":
+        types: dict = {}
+        for part in definition.split("=" * 80 + "\n"):
+            if part.strip():
+                types.update(get_types_from_idl(part.split("\n", 1)[1]))
+        store.register(types)
+    else:
+        raise BagError(f"{type_name} is defined in {encoding!r}; only ros2msg and ros2idl are supported")
+    return store
