@@ -35,6 +35,14 @@ class NpzError(PaulError, ValueError):
     """An npz file cannot be used.  The text continues a sentence that begins with the file's name."""
 
 
+class KeypointFileError(PaulError, ValueError):
+    """A file of 2D keypoints cannot be used."""
+
+
+class OutputError(PaulError):
+    """An output file cannot be written, or would overwrite an input."""
+
+
 class BagError(PaulError):
     """A bag cannot be read or written.
 
@@ -45,10 +53,6 @@ class BagError(PaulError):
     def __init__(self, text: str, messages_read: int = 0) -> None:
         super().__init__(text)
         self.messages_read = messages_read
-
-
-class WriteError(BagError):
-    """A bag cannot be completed."""
 
 
 class WrongTopicError(BagError):

@@ -19,10 +19,6 @@ from paul_ros.stream.route import MODEL, PREFERRED, Route
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 
 
-class KeypointFileError(PaulError, ValueError):
-    """A file of 2D keypoints cannot be used."""
-
-
 @dataclass(frozen=True)
 class Persons:
     """2D keypoints of N persons, in any images.
