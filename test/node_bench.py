@@ -10,7 +10,7 @@ import numpy as np
 from conftest import LifterProcess, RosMake, header_of, persons_at, seen
 
 from msg_adapters import outputs
-from paul_ros.stream.stream import OUTPUTS
+from paul_ros.stream.messages import OUTPUTS, STANDARD
 
 MAKE = RosMake()
 GOOD = persons_at((0.3, 0, 4))
@@ -29,7 +29,7 @@ class Bench:
 
         self.ros, self.lifter, self.stamp = ros, lifter, 100_000
         self.node = ros.create_node("bench", namespace=lifter.namespace)
-        self.got = {name: [] for name in (*OUTPUTS, "layout", "diagnostics")}
+        self.got = {name: [] for name in (*STANDARD, "layout", "diagnostics")}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         self.keypoints = self.node.create_publisher(
@@ -37,8 +37,9 @@ class Bench:
         )
         self.camera = self.node.create_publisher(class_of("sensor_msgs/msg/CameraInfo"), "camera_info", 10)
         self.depth = self.node.create_publisher(class_of("sensor_msgs/msg/Image"), "depth", 10)
-        for name, type_name in OUTPUTS.items():
-            self.node.create_subscription(class_of(type_name), f"lifter/{name}", self.got[name].append, 10)
+        for name in STANDARD:
+            kind = class_of(OUTPUTS[name].message_type)
+            self.node.create_subscription(kind, f"lifter/{name}", self.got[name].append, 10)
         self.node.create_subscription(String, "lifter/layout", self.got["layout"].append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
@@ -68,7 +69,7 @@ class Bench:
 
         def answered():
             self.send(nobody())
-            return all(self.got[name] for name in (*OUTPUTS, "layout"))
+            return all(self.got[name] for name in (*STANDARD, "layout"))
 
         self.until(answered, "answers on all outputs")
 

@@ -98,11 +98,11 @@ def cloud(make, xy, **stamp):
 def test_persons_of_any_size_stand_where_they_are_measured(stream, make, scale):
     truth = two(scale)
     stream.depth(depth_image(make, background(truth)))
-    frame = stream.keypoints(CLOUD, cloud(make, seen(truth)))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(truth))).frame
     np.testing.assert_allclose(frame.lifted.points, truth, atol=0.03)
     np.testing.assert_allclose(frame.lifted.root, truth[:, [11, 12]].mean(1), atol=0.03)
     np.testing.assert_array_equal(frame.lifted.distance_sigma, SIGMA)
-    assert stream.notes == {"depth_used": 2} and not stream.drops
+    assert stream.ledger.notes == {"depth_used": 2} and not stream.ledger.drops
 
 
 @pytest.mark.parametrize(
@@ -114,39 +114,39 @@ def test_persons_of_any_size_stand_where_they_are_measured(stream, make, scale):
     ],
 )
 def test_what_is_no_measure_of_the_person_changes_nothing(stream, make, metres, note):
-    plain = stream.keypoints(CLOUD, cloud(make, seen(two())))
+    plain = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame
     stream.depth(depth_image(make, metres))
-    frame = stream.keypoints(CLOUD, cloud(make, seen(two())))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame
     np.testing.assert_array_equal(frame.lifted.points, plain.lifted.points)
     np.testing.assert_array_equal(frame.lifted.distance_sigma, plain.lifted.distance_sigma)
-    assert stream.notes == note
-    assert ("remap `depth`" in str(stream.explanations)) == ("depth_of_another_size" in note)
+    assert stream.ledger.notes == note
+    assert ("Remap `depth`" in str(stream.ledger.advice)) == ("depth_of_another_size" in note)
 
 
 def test_only_the_image_of_that_time_counts(stream, make):
     truth = two(0.7)
     stream.depth(depth_image(make, background(truth)))
-    late = stream.keypoints(CLOUD, cloud(make, seen(truth), seconds=7, nanoseconds=40_000_000))
-    assert stream.notes == {"depth_of_another_time": 1} and late.lifted.root[0, 2] > 1.2 * truth[0, 11, 2]
-    assert "same clock" in stream.explanations["depth_of_another_time"]
+    late = stream.keypoints(CLOUD, cloud(make, seen(truth), seconds=7, nanoseconds=40_000_000)).frame
+    assert stream.ledger.notes == {"depth_of_another_time": 1} and late.lifted.root[0, 2] > 1.2 * truth[0, 11, 2]
+    assert "same clock" in stream.ledger.advice["depth_of_another_time"]
     for seconds in range(8, 20):
         stream.depth(depth_image(make, background(truth), header=header_of(make, seconds=seconds)))
     stream.keypoints(CLOUD, cloud(make, seen(truth), nanoseconds=10_000_000))
-    assert stream.notes["depth_used"] == 2
+    assert stream.ledger.notes["depth_used"] == 2
 
 
 def test_persons_that_were_not_lifted_are_no_fault(stream, make):
     xy = seen(two())
     xy[0, 2:] = np.nan
     stream.depth(depth_image(make, background(two())))
-    frame = stream.keypoints(CLOUD, cloud(make, xy))
-    assert frame.lifted.ok.tolist() == [False, True] and "internal_error" not in stream.drops
-    assert stream.notes == {"depth_used": 1}
+    frame = stream.keypoints(CLOUD, cloud(make, xy)).frame
+    assert frame.lifted.ok.tolist() == [False, True] and "internal_error" not in stream.ledger.drops
+    assert stream.ledger.notes == {"depth_used": 1}
 
 
 def test_an_unusable_image_is_a_counted_drop(stream, make):
     stream.depth(depth_image(make, np.ones((4, 4)), encoding="16UC1", step=1))
-    assert stream.drops == {"truncated_data": 1}
+    assert stream.ledger.drops == {"truncated_data": 1}
 
 
 def test_replay_takes_the_depths_of_a_bag(model_file, tmp_path):

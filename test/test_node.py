@@ -9,14 +9,13 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ROOT, LifterProcess, camera_info, header_of, persons_at, seen
+from conftest import LIFTER, ROOT, LifterProcess, camera_info, header_of, persons_at, seen
 from foreign_messages import CLOUD, HRI, OPENDR, LiveMake, hri, opendr
 from foreign_messages import DEFINITIONS as FOREIGN
 from node_bench import GOOD, MAKE, PATIENCE, Bench, class_of, cloud, good, header_in, nobody, set_parameters
@@ -26,7 +25,7 @@ from msg_adapters import outputs
 from paul_ros.layout import load_layout
 from paul_ros.stream import parameters
 from paul_ros.stream.depth import SURFACE
-from paul_ros.stream.stream import OUTPUTS
+from paul_ros.stream.messages import OUTPUTS, STANDARD
 
 
 def half_way(seconds: int):
@@ -131,7 +130,7 @@ def test_header_is_the_inputs_in_every_output(bench):
         return good()(header)
 
     bench.send(fill)
-    for name in OUTPUTS:
+    for name in STANDARD:
         header = header_in(bench.answer(name, 2_000_000_123))
         assert (header.stamp.nanosec, header.frame_id) == (999_999_999, "left eye/optical")
 
@@ -229,7 +228,7 @@ def test_no_torch_in_the_node(bench):
         mapped = maps.read()
     assert "rclpy" in mapped and "torch" not in mapped
     done = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "paul_ros.ros.node", "--help"],
+        [LIFTER[0], "-X", "importtime", *LIFTER[1:], "--help"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -289,9 +288,7 @@ def test_a_signal_while_the_process_imports_ends_it_cleanly(tmp_path, number):
     (tmp_path / "rclpy.py").write_text(f"import os, time\nos.kill(os.getpid(), {int(number)})\ntime.sleep(10)\n")
     env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
     env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(ROOT)])
-    done = subprocess.run(
-        [sys.executable, "-m", "paul_ros.ros.node"], env=env, capture_output=True, text=True, timeout=60
-    )
+    done = subprocess.run(LIFTER, env=env, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -343,7 +340,7 @@ def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, mod
 @pytest.mark.parametrize("type_name", sorted(set(FOREIGN) & set(msg_adapters.SUPPORTED)))
 def test_every_foreign_package_that_is_missing_is_named(type_name):
     """The node's warning is made of this error."""
-    from paul_ros.ros.endpoints import message_class
+    from paul_ros.ros.messages import message_class
 
     with pytest.raises(ImportError, match=type_name.split("/")[0]):
         message_class(type_name)
@@ -396,11 +393,8 @@ def test_arguments_that_cannot_be_used_are_refused(start_lifter, arguments, word
 
 
 @pytest.fixture
-def lifter_node(ros, monkeypatch):
+def lifter_node(ros):
     """The node's object in this process, with the shipped model."""
-    # Importing the node limits the threads of its process; that is undone, for the tests after this.
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        monkeypatch.setenv(variable, "1")
     from paul_ros.ros.node import LifterNode
 
     node = LifterNode()
@@ -410,100 +404,114 @@ def lifter_node(ros, monkeypatch):
 
 
 @pytest.fixture
-def said(lifter_node, monkeypatch):
-    """What the node warns of, at once and each time."""
-    from paul_ros.ros import node
+def warnings(lifter_node, monkeypatch):
+    """The node's warnings, without throttling."""
+    from paul_ros.ros import advisor
 
     texts = []
-    for limit in ("_SILENT_SECONDS", "_NOTES_SECONDS"):
-        monkeypatch.setattr(node, limit, 0.0)
-    monkeypatch.setattr(lifter_node._warn, "_every", 0.0)
-    monkeypatch.setattr(lifter_node._warn, "_say", texts.append)
+    for limit in ("SILENT_SECONDS", "WARNING_SECONDS", "NOTE_SECONDS"):
+        monkeypatch.setattr(advisor, limit, 0.0)
+    monkeypatch.setattr(lifter_node._log, "_write", texts.append)
     return texts
 
 
-def test_silence_is_said_from_the_start(ros, lifter_node, said):
+def test_silence_is_logged_from_the_start(ros, lifter_node, warnings):
     detector = ros.create_node("detector")
     publisher = detector.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "keypoints", 10)
     end = time.monotonic() + PATIENCE
-    while not lifter_node._input.type_name:
+    pipeline = lifter_node.pipeline
+    while not pipeline._input.type_name:
         assert time.monotonic() < end
-        lifter_node._look()
-    said.clear()
-    lifter_node._report()
-    assert len(said) == 1 and re.fullmatch(r"no keypoints for \d+ s on /keypoints", said[0])
+        pipeline._search_input()
+    warnings.clear()
+    pipeline._report()
+    assert len(warnings) == 1 and re.fullmatch(r"no keypoints for \d+ s on /keypoints", warnings[0])
     detector.destroy_publisher(publisher)
-    while not said[-1].endswith("nobody publishes it; remap `keypoints` to your detector"):
-        assert time.monotonic() < end, said
-        lifter_node._report()
+    while not warnings[-1].endswith("nobody publishes it. Remap `keypoints` to your detector."):
+        assert time.monotonic() < end, warnings
+        pipeline._report()
     detector.destroy_node()
 
 
-def test_what_was_odd_but_used_is_said_with_what_to_do(lifter_node, said):
+def test_notes_are_logged_with_what_to_do(lifter_node, warnings):
     distorted = camera_info(MAKE)
     distorted.d = [0.1, 0.0, 0.0, 0.0, 0.0]
     for count in (1, 2):
-        lifter_node._on_camera_info(distorted)
-        lifter_node._report_notes()
-        assert said.pop().startswith(f"distorted_image, {count} so far. CameraInfo has distortion but no P")
-    lifter_node._report_notes()
-    assert not said
+        lifter_node.pipeline._on_camera_info(distorted)
+        lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
+        assert warnings.pop().startswith(f"distorted_image, {count} so far. CameraInfo has distortion but no P")
+    lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
+    assert not warnings
 
 
-@dataclass
-class FrameThatCounts:
-    """Stands in for a lifted frame: keeps the names of the messages it was asked for; one of them may fail."""
+@pytest.fixture
+def built(lifter_node, monkeypatch):
+    """Names of the outputs that the node has built for a frame, in order."""
+    names = []
+    for name, output in OUTPUTS.items():
 
-    faulty: str = ""
-    header: object = field(default_factory=lambda: header_of(MAKE))
-    built: list = field(default_factory=list)
+        def build(make, frame, attitudes, name=name, original=output.build):
+            names.append(name)
+            return original(make, frame, attitudes)
 
-    def message(self, name, make):
-        self.built.append(name)
-        if name == self.faulty:
-            raise ZeroDivisionError("on purpose")
-        return make(OUTPUTS[name])
+        monkeypatch.setitem(OUTPUTS, name, replace(output, build=build))
+    writers = lifter_node.pipeline._topics._builder._writers
+    for name, (writer, values) in writers.items():
 
-    def serialised(self, name, writer):
-        from rclpy.serialization import serialize_message
+        def write(header, array, name=name, writer=writer):
+            names.append(name)
+            return writer(header, array)
 
-        return serialize_message(self.message(name, lambda type_name: class_of(type_name)()))
+        monkeypatch.setitem(writers, name, (write, values))
+    return names
 
 
-def test_outputs_nobody_listens_to_are_not_built(ros, lifter_node):
-    def built():
-        frame = FrameThatCounts()
-        lifter_node._publish(frame)
-        return frame.built
+def lifted_frame(node):
+    from rclpy.serialization import serialize_message
 
-    assert built() == []
+    return node.stream.keypoints(CLOUD, serialize_message(good()(header_of(MAKE)))).frame
+
+
+def test_outputs_nobody_listens_to_are_not_built(ros, lifter_node, built):
+    frame = lifted_frame(lifter_node)
+
+    def built_now():
+        built.clear()
+        lifter_node.pipeline._topics.publish_frame(frame)
+        return built
+
+    assert built_now() == []
     listener = ros.create_node("listener")
-    listener.create_subscription(class_of(OUTPUTS["poses"]), "/lifter/poses", lambda msg: None, 10)
+    listener.create_subscription(class_of(OUTPUTS["poses"].message_type), "/lifter/poses", lambda msg: None, 10)
     end = time.monotonic() + PATIENCE
-    while not built() and time.monotonic() < end:
+    while not built_now() and time.monotonic() < end:
         time.sleep(0.02)
-    assert built() == ["poses"]
+    assert built_now() == ["poses"]
     listener.destroy_node()
 
 
-def test_a_fault_in_building_leaves_no_half_frame(ros, lifter_node):
+def test_a_fault_in_building_leaves_no_half_frame(ros, lifter_node, built, monkeypatch):
     got = []
     listener = ros.create_node("listener")
-    for name, type_name in OUTPUTS.items():
-        listener.create_subscription(class_of(type_name), f"/lifter/{name}", got.append, 10)
+    for name in STANDARD:
+        listener.create_subscription(class_of(OUTPUTS[name].message_type), f"/lifter/{name}", got.append, 10)
     end = time.monotonic() + PATIENCE
-    while not all(output.get_subscription_count() for output in lifter_node._outputs.values()):
+    topics, frame = lifter_node.pipeline._topics, lifted_frame(lifter_node)
+    while not all(topics.frame_publishers[name].get_subscription_count() for name in STANDARD):
         assert time.monotonic() < end
         time.sleep(0.02)
-    with pytest.raises(ZeroDivisionError):
-        lifter_node._publish(FrameThatCounts(faulty="markers"))
-    lifter_node._publish(FrameThatCounts())
-    while len(got) < len(OUTPUTS) and time.monotonic() < end:
+    with monkeypatch.context() as fault:
+        fault.setitem(OUTPUTS, "markers", replace(OUTPUTS["markers"], build=lambda *_: 1 / 0))
+        with pytest.raises(ZeroDivisionError):
+            topics.publish_frame(frame)
+    assert set(built) == set(STANDARD) - {"markers"}
+    topics.publish_frame(frame)
+    while len(got) < len(STANDARD) and time.monotonic() < end:
         ros.spin_once(listener, timeout_sec=0.02)
-    # What was published first comes first on each topic: had the faulty frame gone out in part, one more would come.
+    # Each topic keeps its order: if the faulty frame had gone out in part, one more message would come.
     for _ in range(10):
         ros.spin_once(listener, timeout_sec=0.02)
-    assert len(got) == len(OUTPUTS)
+    assert len(got) == len(STANDARD)
     listener.destroy_node()
 
 
@@ -515,7 +523,7 @@ OPENDR_POINTS = len(load_layout("openpose18").names)
 
 def one_person(node, build, seconds: int, **person) -> None:
     msg = build(LiveMake(), header_of(MAKE, seconds), **person)
-    node._on_keypoints(OPENDR if build is opendr else HRI, msg, "/humans/bodies/anna/skeleton2d", 0)
+    node.pipeline.on_keypoints(OPENDR if build is opendr else HRI, msg, "/humans/bodies/anna/skeleton2d", 0)
 
 
 @pytest.fixture
@@ -524,7 +532,7 @@ def poses_of_node(ros, lifter_node):
     from rclpy.executors import SingleThreadedExecutor
 
     got, listener = [], ros.create_node("listener")
-    listener.create_subscription(class_of(OUTPUTS["poses"]), "/lifter/poses", got.append, 10)
+    listener.create_subscription(class_of(OUTPUTS["poses"].message_type), "/lifter/poses", got.append, 10)
     executor = SingleThreadedExecutor()
     executor.add_node(lifter_node)
 
@@ -536,7 +544,8 @@ def poses_of_node(ros, lifter_node):
             ros.spin_once(listener, timeout_sec=0)
         return got
 
-    until(lambda _: lifter_node._outputs["poses"].get_subscription_count(), "the listener")
+    poses = lifter_node.pipeline._topics.frame_publishers["poses"]
+    until(lambda _: poses.get_subscription_count(), "the listener")
     yield until
     executor.shutdown()
     listener.destroy_node()
@@ -551,27 +560,27 @@ def test_persons_in_a_message_each_are_published_when_no_more_come(lifter_node, 
     one_person(lifter_node, opendr, 2, pose=POSES[0], ident=1)
     _, image = poses_of_node(lambda got: len(got) == 2, "one more image")
     assert (image.header.stamp.sec, len(image.poses)) == (2, OPENDR_POINTS)
-    assert lifter_node._silence.is_canceled()
-    assert lifter_node.stream.counts == dict(frames=2, persons=3, lifted=3) and not lifter_node.stream.drops
+    assert lifter_node.pipeline._group_timer.is_canceled()
+    assert lifter_node.stream.counts == dict(frames=2, persons=3, lifted=3) and not lifter_node.stream.ledger.drops
 
 
 def test_a_node_kept_from_running_between_two_persons_tears_no_image(lifter_node, poses_of_node):
     """Timers come before messages: the first late tick finds the second person still waiting."""
     one_person(lifter_node, opendr, 1, pose=POSES[0], ident=1)
     time.sleep(0.05)
-    lifter_node._on_silence()
+    lifter_node.pipeline._on_group_tick()
     one_person(lifter_node, opendr, 1, pose=POSES[1], ident=2)
     (image,) = poses_of_node(bool, "the image")
     assert len(image.poses) == 2 * OPENDR_POINTS and lifter_node.stream.counts["frames"] == 1
 
 
 def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
-    from paul_ros.ros.node import _spin
+    from paul_ros.ros.lifter_process import spin
 
     one_person(lifter_node, opendr, 1, pose=POSES[0])
     stop = threading.Event()
     stop.set()
-    _spin(lifter_node, stop)
+    spin(lifter_node, stop)
     lifter_node.end()
     assert "1 frames, 1 of 1 persons lifted" in lifter_node.summary()
     (image,) = poses_of_node(bool, "the image")
@@ -580,10 +589,10 @@ def test_the_last_persons_are_published_at_the_end(lifter_node, poses_of_node):
 
 def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):
     published = []
-    monkeypatch.setattr(lifter_node, "_publish", published.append)
-    lifter_node._on_camera_info(camera_info(MAKE))
+    monkeypatch.setattr(lifter_node.pipeline._topics, "publish_frame", published.append)
+    lifter_node.pipeline._on_camera_info(camera_info(MAKE))
     one_person(lifter_node, hri, 1, pose=POSES[0])
-    lifter_node.flush()
+    lifter_node.pipeline.flush()
     assert [frame.keypoints.ids for frame in published] == [("anna",)]
 
 
@@ -591,12 +600,12 @@ def test_the_executor_waits_once_for_a_callback(lifter_node, monkeypatch):
     """rclpy's own waits a second time after each."""
     import rclpy.executors
 
-    from paul_ros.ros.node import _OneThread
+    from paul_ros.ros.rclpy_internals import OneThreadExecutor
 
     waits, count = [], rclpy.executors.NumberOfEntities
     monkeypatch.setattr(rclpy.executors, "NumberOfEntities", lambda *sizes: waits.append(sizes) or count(*sizes))
     found = []
-    for kind in (_OneThread, rclpy.executors.SingleThreadedExecutor):
+    for kind in (OneThreadExecutor, rclpy.executors.SingleThreadedExecutor):
         executor, ticks = kind(), []
         executor.add_node(lifter_node)
         timer = lifter_node.create_timer(0.02, lambda ticks=ticks: ticks.append(1))
@@ -615,15 +624,15 @@ def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
 
     data = serialize_message(good()(header_of(MAKE)))
     for part in (data[:40], data[:-1], b"", b"\0\1\0\0" + bytes(8) + b"\xff" * 60):
-        lifter_node._on_keypoints(CLOUD, part, "/keypoints", 0)
-    assert lifter_node.stream.drops == {"damaged_bytes": 4} and lifter_node.stream.counts["frames"] == 0
-    lifter_node._on_keypoints(CLOUD, data, "/keypoints", 0)
+        lifter_node.pipeline.on_keypoints(CLOUD, part, "/keypoints", 0)
+    assert lifter_node.stream.ledger.drops == {"damaged_bytes": 4} and lifter_node.stream.counts["frames"] == 0
+    lifter_node.pipeline.on_keypoints(CLOUD, data, "/keypoints", 0)
     assert lifter_node.stream.counts["lifted"] == 1
 
 
 def test_parameter_file_and_table_come_from_one_place():
     shipped = (ROOT / "config" / "lifter.yaml").read_text()
     assert shipped == parameters.as_yaml(), "python -m paul_ros.stream.parameters > config/lifter.yaml"
-    assert parameters.as_markdown() in (ROOT / "README.md").read_text(), (
-        "paste paul_ros.stream.parameters.as_markdown()"
-    )
+    reference = ROOT / "docs/reference/node.md"
+    page = reference if reference.exists() else ROOT / "README.md"
+    assert parameters.as_markdown() in page.read_text(), "paste paul_ros.stream.parameters.as_markdown()"

@@ -215,18 +215,17 @@ def test_the_same_path_is_read_anew(managed, model_file, other_model, tmp_path):
 
 def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeypatch, other_model, model_file):
     from foreign_messages import OPENDR, LiveMake, opendr
-    from test_node import POSES
-
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        monkeypatch.setenv(variable, "1")
     from rclpy.parameter import Parameter
+    from test_node import POSES
 
     from paul_ros.ros.node import LifterNode
 
     node, models = LifterNode(), []
     node.start()
-    monkeypatch.setattr(node, "_publish", lambda frame: models.append(node.stream.lifter.model.name))
-    node._on_keypoints(OPENDR, opendr(LiveMake(), header_of(MAKE), pose=POSES[0]), "/keypoints", 0)
+    monkeypatch.setattr(
+        node.pipeline._topics, "publish_frame", lambda frame: models.append(node.stream.lifter.model.name)
+    )
+    node.pipeline.on_keypoints(OPENDR, opendr(LiveMake(), header_of(MAKE), pose=POSES[0]), "/keypoints", 0)
     before = node.stream.lifter.model.name
     assert not models
     assert node.set_parameters([Parameter("model", value=str(other_model))])[0].successful
@@ -237,11 +236,12 @@ def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeyp
 
 def test_a_fault_in_a_transition_is_told_and_leads_back(ros, monkeypatch, capfd):
     from paul_ros.ros.node import LifterNode
+    from paul_ros.ros.rclpy_internals import lifecycle_state
 
     node = LifterNode()
-    monkeypatch.setattr(node, "_configure", lambda: 1 / 0)
+    monkeypatch.setattr("paul_ros.ros.node.Pipeline", lambda *_: 1 / 0)
     node.trigger_configure()
-    assert node._state_machine.current_state[1] == "unconfigured"
+    assert lifecycle_state(node) == "unconfigured"
     assert "ZeroDivisionError" in capfd.readouterr().err
     monkeypatch.undo()
     node.start()

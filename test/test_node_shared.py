@@ -14,7 +14,7 @@ from conftest import ROOT
 from node_bench import MAKE, class_of
 
 from msg_adapters import outputs
-from paul_ros.stream.stream import OPTIONAL, OUTPUTS
+from paul_ros.stream.messages import OUTPUTS
 
 PACKAGE = "paul_ros"
 POLICY = ElementTree.parse(ROOT / "sros2/lifter.policy.xml").getroot()
@@ -33,8 +33,8 @@ SCHEMA = {
 
 def every_topic() -> set[str]:
     """All that a node without remappings may publish."""
-    names = {name for name in (*OUTPUTS, *OPTIONAL, "layout") if name != "transforms"}
-    return {f"/lifter/{name}" for name in names} | {"/diagnostics", "/tf"}
+    topics = {output.topic.replace("~", "/lifter") for output in OUTPUTS.values()}
+    return topics | {"/lifter/layout", "/diagnostics"}
 
 
 def test_the_policy_keeps_to_the_schema():
@@ -120,7 +120,8 @@ def test_the_view_of_rviz_shows_the_outputs():
         if "Topic" in display:
             assert display["Topic"]["Durability Policy"] == "Volatile"
             shown[display["Topic"]["Value"].removeprefix("/lifter/")] = kinds[display["Class"].rpartition("/")[2]]
-    assert shown.items() <= OUTPUTS.items() and len(shown) == 3
+    published = {name: output.message_type for name, output in OUTPUTS.items()}
+    assert shown.items() <= published.items() and len(shown) == 3
     cloud = next(display for display in manager["Displays"] if "Channel Name" in display)
     assert cloud["Channel Name"] in {field.name for field in points_cloud().fields}
 

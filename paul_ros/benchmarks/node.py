@@ -39,7 +39,7 @@ SLICE_SECONDS = 2.0
 SOAK_SECONDS = 10.0
 """Memory is read so often in a long run."""
 
-_MODULES = {"lifter": "paul_ros.ros.node", "echo": "paul_ros.benchmarks.echo"}
+_MODULES = {"lifter": "paul_ros.ros.lifter_process", "echo": "paul_ros.benchmarks.echo"}
 _POINTS = 17
 _IMAGE = 1280, 720  # pixels; that of the recording
 _FILLED = 0.8  # of its cell, by a person

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`paul demo`: the real node, fed with recorded bags over DDS, its answers recorded and checked.
 
-Three processes: this one records, `python -m paul_ros.ros.node` lifts, `python -m paul_ros.offline.demo BAG` plays.
+Three processes: this one records, `python -m paul_ros.ros.lifter_process` lifts, and `python -m
+paul_ros.offline.demo BAG` plays.
 """
 
 from __future__ import annotations
@@ -187,7 +188,7 @@ def run_live(bag: Path, recording: Path, model: str | None = None) -> Live:
     with tempfile.TemporaryFile() as log, BagWriter(recording) as writer, _Recorder(environment, writer) as recorder:
         began = time.monotonic()
         parameters = ["-p", f"layout:={LAYOUT}", *(["-p", f"model:={model}"] if model else [])]
-        with process(["paul_ros.ros.node", "--ros-args", *parameters], environment, log) as node:
+        with process(["paul_ros.ros.lifter_process", "--ros-args", *parameters], environment, log) as node:
             recorder.spin_until(lambda: recorder.counts[f"{NODE}/layout"], node, log, _PATIENCE)
             ready = time.monotonic() - began
             with process(["paul_ros.offline.demo", str(bag)], environment, log) as player:

@@ -17,7 +17,7 @@ from typing import Callable
 import numpy as np
 
 import msg_adapters
-from msg_adapters import Intrinsics, Keypoints2D, MessageError
+from msg_adapters import Intrinsics, Keypoints2D
 from msg_adapters.keypoints import stamp_ns
 from paul_ros import __version__, metrics
 from paul_ros.errors import BagError, WriteError, WrongTopicError
@@ -33,7 +33,10 @@ from paul_ros.offline.bag import (
     read_records,
     topics_of,
 )
-from paul_ros.stream.stream import Frame, LiftStream
+from paul_ros.stream.frame import Frame
+from paul_ros.stream.messages import MessageBuilder
+from paul_ros.stream.reasons import REASONS
+from paul_ros.stream.stream import LiftStream
 
 NODE = "/lifter"
 """Output topics lie below this name, as those of the node of that name do."""
@@ -117,7 +120,8 @@ class Replay:
     @property
     def why_not(self) -> list[str]:
         """What to do about messages that were dropped and persons that were left out; each reason once."""
-        return [text for reason, text in self.stream.explanations.items() if self.stream.drops[reason]]
+        ledger = self.stream.ledger
+        return [text for reason, text in ledger.advice.items() if ledger.drops[reason]]
 
 
 def replay(
@@ -160,6 +164,7 @@ class _Shell:
         self.done, self.topics, self.writer = done, topics, writer
         self.keypoint_messages = 0
         self._make = BagMessages()
+        self._builder = MessageBuilder(self._make)
         self._described: dict = {}
         self._truth: dict[int, np.ndarray] = {}
         self._last_time = 0
@@ -189,8 +194,7 @@ class _Shell:
         try:
             message = record.message()
         except BagError as error:
-            with self.done.stream.guard():
-                raise MessageError("undecodable", str(error)) from error
+            self.done.stream.ledger.drop("undecodable", str(error))
         else:
             take(message)
 
@@ -200,9 +204,9 @@ class _Shell:
         self._hand(record, "keypoints", lambda message: self._lift(record, message), *msg_adapters.SUPPORTED)
 
     def _lift(self, record: Record, message: object) -> None:
-        frame = self.done.stream.keypoints(record.type_name, message, record.topic)
+        answer = self.done.stream.keypoints(record.type_name, message, record.topic)
         self._write_layout(record.log_time)
-        self._take_frame(frame)
+        self._take_frame(answer.frame)
 
     def finish(self) -> None:
         """Takes what the stream has kept for more persons of the last image, and the truth: its layout is known now."""
@@ -217,7 +221,7 @@ class _Shell:
         stamp = frame.keypoints.stamp
         self.done.frames.append(LiftedFrame(stamp, frame.keypoints, frame.lifted, frame.given, camera))
         if self.writer:
-            for name, message in frame.messages(self._make).items():
+            for name, message in self._builder.messages(frame).items():
                 self.writer.write(f"{NODE}/{name}", message, self._last_time)
 
     def _take_truth(self, message: object) -> None:
@@ -230,7 +234,7 @@ class _Shell:
         route = self.done.stream.route
         points = len(route.given.names)
         if len(flat) % points:
-            self.done.stream.drops["truth_wrong_point_count"] += 1
+            self.done.stream.ledger.drop("truth_wrong_point_count", REASONS["truth_wrong_point_count"].advice)
             return
         self.done.truth[stamp] = route.points_out(flat.reshape(-1, points, 3))
 
@@ -272,9 +276,9 @@ def evaluate(done: Replay) -> dict:
         "frames": stream.counts["frames"],
         "persons": stream.counts["persons"],
         "lifted": stream.counts["lifted"],
-        "dropped": dict(sorted(stream.drops.items())),
-        "noted": dict(sorted(stream.notes.items())),
-        "advice": dict(sorted(stream.explanations.items())),
+        "dropped": dict(sorted(stream.ledger.drops.items())),
+        "noted": dict(sorted(stream.ledger.notes.items())),
+        "advice": dict(sorted(stream.ledger.advice.items())),
         "units": stream.units,
         **errors(with_truth(done, done.frames), done.layout.root),
         "reprojection_median_px": _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way of a keypoint through the node: from the detector's layout to the model's, and on to the one published.
+"""The route of a keypoint: from the detector's layout to the model's, and on to the output's.
 
-Points find their place by name, so one model serves every detector whose points it has; the rest is hidden to it, and
-completed by it. Which layout a detector uses is found from its messages where nobody says it.
+Layouts are mapped by the names of their points, so one model serves every detector. Points that a detector lacks are
+hidden, and the model completes them. If no layout is set, it is found from the messages.
 """
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,24 +20,35 @@ from paul_ros.layout import Layout, Mapping, layout_names, load_layout
 from paul_ros.lifter import Lifted
 
 PREFERRED = ("coco17", "h36m17", "openpose18", "body25", "mediapipe33")
-"""Of the shipped layouts with as many points as a message has, the first of these is taken, then any other."""
+"""Shipped layouts in the order in which a message's number of points is tried; the others follow."""
 
 MODEL = "model"
-"""As output layout: the model's own, whatever the input."""
+"""Value of `output_layout` that stands for the model's own layout."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """Three layouts and the mappings between them. into: input to model; out: model to output, all points of it."""
+    """The two mappings between three layouts.
+
+    Attributes:
+        into: from the input's layout to the model's.
+        out: from the model's layout to the output's; the model has all points of the output.
+    """
 
     into: Mapping
     out: Mapping
 
     @classmethod
     def between(cls, given: Layout, model: Layout, output: Layout | None = None) -> Route:
-        """output: None = the input's layout where the model completes every point of that, else the model's.
+        """Make the route between layouts.
 
-        Raises LayoutError: input and model have too little in common, or the model lacks a point of the output.
+        Args:
+            given: layout of the input.
+            model: layout of the model.
+            output: layout of the output; None = the input's if the model has all its points, else the model's.
+
+        Raises:
+            LayoutError: input and model have too few points in common, or the model lacks a point of the output.
         """
         return cls(given.map_to(model), _outward(model, given, output))
 
@@ -47,26 +59,26 @@ class Route:
 
     @property
     def output(self) -> Layout:
-        """The layout of what is published."""
+        """The output's layout."""
         return self.out.target
 
     def keypoints_in(self, keypoints: Keypoints2D, min_confidence: float) -> Keypoints2D:
-        """Of the input's layout -> of the model's; low confidences are hidden."""
+        """Map keypoints from the input's layout to the model's; hide those of low confidence."""
         sure = keypoints.visible & (keypoints.confidence >= min_confidence)
         xy, confidence, visible = self.into(keypoints.xy, keypoints.confidence, sure)
         return replace(keypoints, xy=xy, confidence=np.where(visible, confidence, 0.0), visible=visible)
 
     def keypoints_out(self, keypoints: Keypoints2D) -> Keypoints2D:
-        """Of the model's layout -> of the output's."""
+        """Map keypoints from the model's layout to the output's."""
         xy, confidence, visible = self.out(keypoints.xy, keypoints.confidence, keypoints.visible)
         return replace(keypoints, xy=xy, confidence=confidence, visible=visible)
 
     def lifted_out(self, lifted: Lifted) -> Lifted:
-        """Of the model's layout -> of the output's; root and `used` stay the model's."""
+        """Map the points from the model's layout to the output's; root and `used` stay the model's."""
         return replace(lifted, points=self.out.values(lifted.points))
 
     def points_out(self, points: np.ndarray) -> np.ndarray:
-        """3D points (N,P,3) of the input's layout -> (N,Q,3) of the output's; NaN for those that the input lacks."""
+        """Map 3D points (N,P,3) from the input's layout to the output's, (N,Q,3); NaN for those the input lacks."""
         return self.out.values(self.into.values(points))
 
 
@@ -83,16 +95,22 @@ def _outward(model: Layout, given: Layout, output: Layout | None) -> Mapping:
 
 
 def missing(model: Layout, target: Layout) -> list[str]:
-    """Names of the target's points that the model's layout neither has nor derives."""
+    """Return the names of the target's points that the model's layout neither has nor derives."""
     return [name for name in target.names if name not in model.names and name not in model.derived]
 
 
-def read_unknown(model: Layout, type_name: str, msg, source: Source) -> tuple[Keypoints2D, Layout]:
-    """A message of which nobody said the layout, and the layout that it was read in.
+def read_unknown(model: Layout, type_name: str, msg: Any, source: Source) -> tuple[Keypoints2D, Layout]:
+    """Read a message in the layout that fits it best.
 
-    That is the one whose points the message names, if the model shares enough of them; else the model's own if the
-    number of points is right for it; else the first shipped layout of that number that maps onto the model, in the
-    order of PREFERRED. Raises MessageError as `msg_adapters.read` does; WrongPointCount where none has the number.
+    The candidates, in order: the layout whose points the message names, the model's own, and the shipped layouts in the
+    order of PREFERRED. All but the model's must map onto the model. The first with the right number of points is taken.
+
+    Returns:
+        The keypoints and the layout in which they were read.
+
+    Raises:
+        WrongPointCount: no candidate has as many points.
+        MessageError: as `msg_adapters.read`.
     """
     refusal: WrongPointCount | None = None
     for layout in _candidates(model, msg_adapters.named_layout(type_name, msg)):
@@ -100,6 +118,7 @@ def read_unknown(model: Layout, type_name: str, msg, source: Source) -> tuple[Ke
             return msg_adapters.read(type_name, msg, len(layout.names), replace(source, names=layout.names)), layout
         except WrongPointCount as error:
             refusal = refusal or error
+    assert refusal is not None  # the model's own layout is always a candidate
     raise refusal
 
 
@@ -111,7 +130,7 @@ def _candidates(model: Layout, named: str | None) -> list[Layout]:
 
 @functools.cache
 def _shipped() -> tuple[Layout, ...]:
-    """In the order of PREFERRED. Reading them takes a tenth of a second."""
+    """Return the shipped layouts in the order of PREFERRED; reading them takes a tenth of a second."""
     return tuple(load_layout(name) for name in dict.fromkeys([*PREFERRED, *layout_names()]))
 
 
