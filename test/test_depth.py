@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images: read as they are, used where they tell the root's distance, ignored with a reason where they do not."""
+"""Depth images place persons if they show the root's distance; otherwise they are ignored with a reason."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
 def depth_image(make, metres: np.ndarray, encoding: str = "32FC1", big: bool = False, pad: int = 0, **changes):
-    """(H,W) metres as a message; pad: bytes after every row."""
+    """Return (H,W) metres as a message with `pad` bytes after every row."""
     form, unit = ("f4", 1.0) if encoding == "32FC1" else ("u2", 0.001)
     rows = np.nan_to_num(metres / unit, nan=np.nan if form == "f4" else 0).astype((">" if big else "<") + form)
     height, width = metres.shape
@@ -77,12 +77,12 @@ def stream(model_file, make) -> LiftStream:
 
 
 def two(scale: float = 1.0) -> np.ndarray:
-    """Two persons, so many times as large and as far away as they are taken for."""
+    """Return two persons, `scale` times as large and as far away as the model assumes."""
     return scale * persons_at((0.3, 0, 4), (-1, 0.1, 5))
 
 
 def background(points: np.ndarray, wall: float = 9.0) -> np.ndarray:
-    """The depths (480,640) of persons, flat and as broad as their hips, before a wall."""
+    """Return the depths (480,640) of a wall and of persons before it, flat and as broad as their hips."""
     metres = np.full((480, 640), wall)
     for x, y, z in points[:, [11, 12]].mean(1):
         u, v, r = FOCAL * x / z + CENTRE[0], FOCAL * y / z + CENTRE[1], 0.2 * FOCAL / z

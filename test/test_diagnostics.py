@@ -122,7 +122,7 @@ def test_persons_unlike_the_model_are_a_warning_if_they_are_most(health, stream,
 
 
 def test_a_person_left_out_or_a_message_lost_is_no_error(health, stream):
-    health.received(100.5)  # and waits for the rest of its image
+    health.received(100.5)  # it waits for the rest of its image
     stream.ledger.drop("missed", "lost", 3)
     stream.ledger.drop("person_too_few_points", "left out", 2)
     assert health.report(101.0, stream).level == WARN
@@ -158,7 +158,7 @@ def test_rates_are_of_the_time_since_the_last_report(health, stream):
     assert (values["rate_in_hz"], values["rate_out_hz"]) == ("0.0", "0.0")
 
 
-def test_latency_is_told_where_the_clocks_agree(health, stream):
+def test_latency_is_known_if_the_clocks_agree(health, stream):
     health.published(frame(stamp=50 * S), 3 * S)  # from the future
     health.published(frame(stamp=0), 1_700_000_000 * S)  # a bag of long ago
     values = health.report(101.0, stream).values
@@ -180,7 +180,7 @@ def test_shares_are_of_the_persons_lifted(health, stream):
     assert health.report(102.0, stream).values["certified_share"] == "none"
 
 
-def test_model_and_layouts_are_told(health, stream):
+def test_model_and_layouts_are_reported(health, stream):
     values = health.report(101.0, stream, input_type="a/msg/B").values
     assert (values["model"], len(values["model_sha256"]), values["input_type"]) == ("stand", 64, "a/msg/B")
     assert (values["input_layout"], values["layout"]) == (None, "coco17")

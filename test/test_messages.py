@@ -59,13 +59,13 @@ def test_ambiguity_and_distance_sigma_stand_beside_every_point(stream, make):  #
     data = np.frombuffer(message.data, "<f4").reshape(2, 17, 8)
     for column, value in ((6, frame.lifted.ambiguity), (7, frame.lifted.distance_sigma)):
         np.testing.assert_array_equal(data[..., column], np.repeat(np.float32(value)[:, None], 17, axis=1))
-    # The shape is exact, so what is left is the spread of people's heights.
+    # The shape is exact, so only the spread of people's heights is left.
     np.testing.assert_allclose(frame.lifted.distance_sigma, 0.06 * np.linalg.norm(frame.lifted.root, axis=1), rtol=0.05)
     assert message.is_dense
 
 
 def test_one_pose_a_person_in_bodies(stream, make):  # noqa: F811
-    """PERSON looks at the camera: x to the camera, y to the right of the image, z up."""
+    """PERSON looks at the camera: x points to the camera, y to the right of the image, z up."""
     stream.camera_info(camera_info(make))
     xy = seen(persons_at((0.3, 0, 4), (1, 0, 4), (-1, 0.1, 5)))
     xy[1, 2:] = np.nan
@@ -89,7 +89,7 @@ def test_body_axes_are_worked_out_once_and_only_where_asked_for(stream, make, mo
 
 
 def test_bytes_in_and_out_say_the_same_as_messages(model_file, bag_make):
-    """PointCloud2 in, PoseArray and PointCloud2 out: one message with objects all the way, and the same serialised."""
+    """PointCloud2 in, PoseArray and PointCloud2 out: bytes and objects are the same messages."""
     store = bag_make.store
     msg = outputs.keypoints_cloud(
         bag_make, header_of(bag_make), seen(persons_at((0, 0, 4), (1, 0, 5))), np.ones((2, 17)), ["7", "9"]

@@ -45,7 +45,7 @@ def half_way(seconds: int):
 
 
 def crowd(header):
-    """10,000 persons in one byte a point, x and y the same: best effort may lose a message of megabytes."""
+    """10,000 persons in one byte per point, with x = y: best effort may lose a message of megabytes."""
     same = [MAKE("sensor_msgs/msg/PointField", name=name, offset=0, datatype=2, count=1) for name in "xy"]
     return MAKE(
         "sensor_msgs/msg/PointCloud2",
@@ -71,7 +71,7 @@ def fields(*names_and_datatypes) -> list:
 #: Bad input -> (message, the reason it is counted by, a word of the advice in the log).
 BAD = {
     "wrong field names": (cloud(seen(GOOD), fields=fields(("u", 7), ("v", 7))), "wrong_fields", "x and y"),
-    # Its advice is not in the log: the same reason is not explained again within seconds.
+    # Its advice is not in the log: warnings of one reason are throttled.
     "wrong field type": (cloud(seen(GOOD), fields=fields(("x", 7), ("y", 99))), "wrong_fields", ""),
     "3D cloud": (cloud(seen(GOOD), fields=fields(("x", 7), ("y", 7), ("z", 7))), "not_2d", "3D cloud"),
     "NaN everywhere": (cloud(np.full((1, 17, 2), np.nan)), "person_too_few_points", "left out"),
@@ -84,7 +84,7 @@ BAD = {
 
 @pytest.fixture(scope="module")
 def bench(ros, start_lifter, model_file):
-    """One lifter with the shipped parameter file and no CameraInfo, shared by the tests that leave it so."""
+    """One lifter with the shipped parameter file and no CameraInfo, shared by tests that send none."""
     lifter = start_lifter("--params-file", str(ROOT / "config" / "lifter.yaml"), "-p", f"model:={model_file}")
     bench = Bench(ros, lifter)
     bench.matched()
@@ -94,19 +94,19 @@ def bench(ros, start_lifter, model_file):
 
 @pytest.fixture(scope="module")
 def after_bad_input(bench):
-    """Diagnostics after every bad message, each sent until it is complained of, then a good one answered."""
+    """Diagnostics after all bad messages. Each is sent until the log warns of it; then a good one is answered."""
     for fill, reason, _ in BAD.values():
 
-        def complained():
+        def warned():
             bench.send(fill)
             bench.lifts()
             return f"dropped: {reason}" in bench.lifter.log()
 
-        bench.until(complained, reason)
+        bench.until(warned, reason)
     return bench.diagnosed()
 
 
-def test_without_camera_info_units_are_the_models_and_it_says_so_once(bench):
+def test_without_camera_info_units_are_the_models_and_one_warning_is_logged(bench):
     points = bench.lifts()
     assert bench.units() == "model"
     # The root point of a person in model units is the origin.
@@ -116,7 +116,7 @@ def test_without_camera_info_units_are_the_models_and_it_says_so_once(bench):
     assert bench.lifter.log().count("model units") == 1
 
 
-def test_the_layout_that_was_found_is_said_once(bench):
+def test_the_layout_that_was_found_is_logged_once(bench):
     for _ in range(2):
         bench.lifts()
     assert bench.lifter.log().count("is taken to have the points of coco17") == 1
@@ -186,7 +186,7 @@ def test_frames_that_come_while_the_node_is_busy_are_counted(bench):
     assert missed > 0 and missed + lifted == 101
 
 
-def test_diagnostics_tell_counts_times_units_and_model(bench, model_file):
+def test_diagnostics_have_counts_times_units_and_model(bench, model_file):
     bench.lifts()
     values = bench.diagnosed()
     assert int(values["frames"]) >= int(values["lifted"]) > 0
@@ -204,10 +204,10 @@ def test_parameters_may_change_where_the_table_says_so(bench):
     assert int(bench.diagnosed()["dropped_too_many_persons"]) >= 1
     assert set_parameters(bench, max_persons=64, min_confidence=0.5) == ["", ""]
     assert set_parameters(bench, person_height=1.2, smoothing=2.0) == ["", ""]
-    told = ("person_height", "size_spread", "smoothing_hz")
-    bench.until(lambda: [bench.layout()[key] for key in told] == [1.2, 0, 2], "the new layout")
+    keys = ("person_height", "size_spread", "smoothing_hz")
+    bench.until(lambda: [bench.layout()[key] for key in keys] == [1.2, 0, 2], "the new layout")
     assert set_parameters(bench, person_height=0.0, smoothing=0.0) == ["", ""]
-    bench.until(lambda: [bench.layout()[key] for key in told] == [1.7, 0.06, 0], "the old layout")
+    bench.until(lambda: [bench.layout()[key] for key in keys] == [1.7, 0.06, 0], "the old layout")
     assert "range" in set_parameters(bench, min_confidence=1.5)[0]
     assert "read-only" in set_parameters(bench, input_type="auto")[0]
 
@@ -253,7 +253,7 @@ def test_camera_info_turns_model_units_into_metres(ros, start_lifter, model_file
     assert bench.diagnosed()["units"] == "m"
 
     def measured():
-        # For the frame after the next: by then it has come, if it was not lost on the way.
+        # For the frame after the next: by then the image has come, unless it was lost.
         bench.depth.publish(half_way(bench.stamp + 2))
         return bench.lifts()[0, 0, 2] > 3 > bench.lifts()[0, 0, 2]
 
@@ -339,7 +339,7 @@ def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, mod
 
 @pytest.mark.parametrize("type_name", sorted(set(FOREIGN) & set(msg_adapters.SUPPORTED)))
 def test_every_foreign_package_that_is_missing_is_named(type_name):
-    """The node's warning is made of this error."""
+    """The node's warning has the text of this error."""
     from paul_ros.ros.messages import message_class
 
     with pytest.raises(ImportError, match=type_name.split("/")[0]):
@@ -347,7 +347,7 @@ def test_every_foreign_package_that_is_missing_is_named(type_name):
 
 
 def refused(lifter: LifterProcess) -> str:
-    """The one line of a node that ends by itself with exit code 1."""
+    """Return the only line of a node that ends by itself with exit code 1."""
     assert lifter.process.wait(PATIENCE) == 1
     assert len(lifter.log().splitlines()) == 1
     return lifter.log()
@@ -515,7 +515,7 @@ def test_a_fault_in_building_leaves_no_half_frame(ros, lifter_node, built, monke
     listener.destroy_node()
 
 
-#: The packages of messages of one person are on no index, so these are handed to the node; all else is real.
+#: No index has the packages of one-person messages, so the tests hand these to the node; all else is real.
 POSES = [dict(zip(load_layout("coco17").names, xy.tolist())) for xy in seen(persons_at((0.3, 0, 4), (-1, 0, 5)))]
 
 OPENDR_POINTS = len(load_layout("openpose18").names)
@@ -528,7 +528,7 @@ def one_person(node, build, seconds: int, **person) -> None:
 
 @pytest.fixture
 def poses_of_node(ros, lifter_node):
-    """Spins the node and a listener to its poses: poses_of_node(condition, what) -> those that came until then."""
+    """Spin the node and a listener: poses_of_node(condition, what) -> the poses that came until the condition held."""
     from rclpy.executors import SingleThreadedExecutor
 
     got, listener = [], ros.create_node("listener")
@@ -565,7 +565,7 @@ def test_persons_in_a_message_each_are_published_when_no_more_come(lifter_node, 
 
 
 def test_a_node_kept_from_running_between_two_persons_tears_no_image(lifter_node, poses_of_node):
-    """Timers come before messages: the first late tick finds the second person still waiting."""
+    """The executor serves timers before messages: at the first late tick the second person still waits."""
     one_person(lifter_node, opendr, 1, pose=POSES[0], ident=1)
     time.sleep(0.05)
     lifter_node.pipeline._on_group_tick()
@@ -597,7 +597,7 @@ def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):
 
 
 def test_the_executor_waits_once_for_a_callback(lifter_node, monkeypatch):
-    """rclpy's own waits a second time after each."""
+    """rclpy's own executor waits a second time after each."""
     import rclpy.executors
 
     from paul_ros.ros.rclpy_internals import OneThreadExecutor
@@ -619,7 +619,7 @@ def test_the_executor_waits_once_for_a_callback(lifter_node, monkeypatch):
 
 
 def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
-    """What comes serialised from another distribution, or damaged."""
+    """Another ROS distribution, or damage, may cause them."""
     from rclpy.serialization import serialize_message
 
     data = serialize_message(good()(header_of(MAKE)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launch files, the layouts of RViz and Foxglove and the security policy: all name what the node really has."""
+"""Launch files, layouts of RViz and Foxglove, and the security policy: all names in them are the node's."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from paul_ros.stream.messages import OUTPUTS
 
 PACKAGE = "paul_ros"
 POLICY = ElementTree.parse(ROOT / "sros2/lifter.policy.xml").getroot()
-#: Element -> (what it may hold, attributes that it must have, attributes of which it must have one), by
-#: sros2's policy.xsd of version 0.2.0.
+#: Element -> (allowed children, required attributes, attributes of which one is required), by sros2's policy.xsd
+#: of version 0.2.0.
 SCHEMA = {
     "policy": ({"enclaves"}, {"version"}, set()),
     "enclaves": ({"enclave"}, set(), set()),
@@ -32,7 +32,7 @@ SCHEMA = {
 
 
 def every_topic() -> set[str]:
-    """All that a node without remappings may publish."""
+    """Topics that a node without remappings may publish."""
     topics = {output.topic.replace("~", "/lifter") for output in OUTPUTS.values()}
     return topics | {"/lifter/layout", "/diagnostics"}
 
@@ -52,7 +52,7 @@ def test_the_policy_keeps_to_the_schema():
 
 
 def allowed(group: str, way: str, namespace: str) -> set[str]:
-    """Full names that the policy allows, were it for a node in this namespace."""
+    """Full names that the policy would allow a node in this namespace."""
     (profile,) = POLICY.iter("profile")
     found = [element.text for part in profile.findall(group) if part.get(way) == "ALLOW" for element in part]
     assert len(set(found)) == len(found)
@@ -63,7 +63,7 @@ def allowed(group: str, way: str, namespace: str) -> set[str]:
 
 @pytest.fixture
 def graph(ros, start_lifter, model_file):
-    """Of a node in simulated time: its publishers, subscriptions, services and namespace."""
+    """Publishers, subscriptions, services and namespace of a node in simulated time."""
     from rclpy.qos import QoSProfile
 
     lifter = start_lifter("-p", f"model:={model_file}", "-p", "use_sim_time:=true")
@@ -100,7 +100,7 @@ def graph(ros, start_lifter, model_file):
 
 def test_the_policy_allows_what_the_node_does_and_no_more(graph):
     publishers, subscriptions, services, namespace = graph
-    # These two need packages that are not here.
+    # These two need packages that are not installed.
     assert publishers == allowed("topics", "publish", namespace) - {"/tf", f"{namespace}/lifter/annotations"}
     assert subscriptions == allowed("topics", "subscribe", namespace)
     assert services == allowed("services", "reply", namespace)
@@ -152,7 +152,7 @@ def test_the_layout_of_foxglove_shows_the_outputs():
 
 
 def test_the_demo_launches_what_there_is():
-    """launch is on no index: the file is read as XML."""
+    """No index has launch, so the file is read as XML."""
     launch = ElementTree.parse(ROOT / "launch/demo.launch.xml").getroot()
     text = ElementTree.tostring(launch, encoding="unicode")
     arguments = {argument.get("name"): argument.get("default") for argument in launch.findall("arg")}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The filter over time: it calms what is still, follows what moves, keeps persons apart, and starts anew in time."""
+"""The filter over time: less jitter at rest, little lag in motion, one track per person, resets."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ FRAME = 33_333_333  # ns
 
 
 def lifted(points: np.ndarray, units: str = "m"):
-    """Persons (N,17,3) as the Lifter gives them."""
+    """Return persons (N,17,3) as the Lifter does."""
     nobody = _nothing(len(points), 17, units)
     return replace(nobody, points=points, root=points[:, HIPS].mean(1), reason=("",) * len(points))
 
 
 def run(filtered: OneEuro, frames: np.ndarray, ids=("1",), start: int = 0) -> np.ndarray:
-    """(F,N,17,3) through the filter, at 30 Hz."""
+    """Filter frames (F,N,17,3) at 30 Hz."""
     return np.array([filtered(ids, start + n * FRAME, lifted(frame), HIPS).points for n, frame in enumerate(frames)])
 
 
@@ -39,7 +39,7 @@ def test_a_person_at_rest_is_calmed():
 
 
 def test_a_person_in_motion_is_followed():
-    """Walking at 1.5 m/s: within a tenth of a second of the way."""
+    """At 1.5 m/s it lags by less than a tenth of a second."""
     way = np.arange(60)[:, None, None, None] / 30 * np.array([1.5, 0, 0])
     raw = PERSON + (0, 0, 4) + way
     behind = np.abs(run(OneEuro(1.0), raw) - raw).max((1, 2, 3))
@@ -101,7 +101,7 @@ def test_the_root_is_that_of_the_filtered_points():
     "stamp, units", [(5 * FRAME + int(FORGET_SECONDS * 1e9) + FRAME, "m"), (2 * FRAME, "m"), (6 * FRAME, "model")]
 )
 def test_it_starts_anew(stamp, units):
-    """After a long silence, after a jump back in time, in other units."""
+    """After a long silence, after a jump back in time, and in other units."""
     filtered, raw = OneEuro(1.0), noisy(7)
     run(filtered, raw[:6])
     np.testing.assert_array_equal(filtered(("1",), stamp, lifted(raw[6], units), HIPS).points, raw[6])
@@ -116,7 +116,7 @@ def test_a_stamp_that_repeats_breaks_nothing():
 
 @pytest.mark.parametrize("step", [FRAME, 0])
 def test_persons_who_left_are_forgotten(step):
-    """An id of its own in every frame, with stamps and without: what is kept does not grow with time."""
+    """With a new id in every frame, with or without stamps, the number of tracks does not grow."""
     filtered, raw = OneEuro(1.0), lifted(noisy(1)[0].repeat(2, 0))
     for n in range(300):
         filtered(("stays", str(n)), n * step, raw, HIPS)

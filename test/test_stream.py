@@ -38,13 +38,13 @@ def cloud(make, xy: np.ndarray, confidence=None, ids=None, **stamp):
 
 
 def assert_drops(stream: LiftStream, type_name: str, msg) -> None:
-    """The answer is that the message was dropped."""
+    """Assert that the message is dropped."""
     answer = stream.keypoints(type_name, msg)
     assert (answer.outcome, answer.frame) == (Outcome.DROPPED, None)
 
 
 def assert_lifts(stream: LiftStream, make) -> None:
-    """The stream still answers a good message."""
+    """Assert that the stream still answers a good message."""
     answer = stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
     assert answer.outcome is Outcome.LIFTED and answer.frame.lifted.ok.all()
 
@@ -53,7 +53,7 @@ def test_persons_in_metres_where_they_stand(stream, make):
     stream.camera_info(camera_info(make))
     frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD))).frame
     assert frame.lifted.units == "m" and frame.lifted.ok.all()
-    # Weak perspective leaves some per cent of the size unexplained at these distances.
+    # At these distances weak perspective leaves a few per cent of the size unexplained.
     assert np.linalg.norm(frame.lifted.points - GOOD, axis=-1).max() < 0.15
     assert stream.counts == dict(frames=1, persons=2, lifted=2) and not stream.ledger.drops
     assert len(stream.lift_us) == 1 and stream.lift_us[0] > 0
@@ -80,14 +80,14 @@ def test_the_description_says_which_matrix_of_camera_info_was_used(stream, make)
     stream.camera_info(info)
     assert "CameraInfo's K" in stream.describe()["scale_source"]
     assert "distortion is not corrected" in stream.describe()["scale_source"]
-    # Used all the same: it is a note, not a drop.
+    # It is used all the same, so it is a note and not a drop.
     assert stream.ledger.notes == {"distorted_image": 1} and not stream.ledger.drops and stream.units == "m"
     assert "rectify" in stream.ledger.advice["distorted_image"]
 
 
 @pytest.mark.parametrize("kind", ["live", "bag"])
 def test_zed_bodies_are_in_the_optical_frame_of_camera_info(stream, bag_make, kind):
-    """Their header names the camera's own frame, x forward: what is lifted would lie on its side in that."""
+    """Their header names the camera's own frame, x forward; lifted persons would lie on their side in it."""
     foreign_make = foreign.LiveMake() if kind == "live" else bag_make
     header = header_of(foreign_make, frame="zed_left_camera_frame")
     pose = dict(zip(stream.route.given.names, seen(persons_at((0, 0, 4)))[0].tolist()))
@@ -101,17 +101,17 @@ def test_zed_bodies_are_in_the_optical_frame_of_camera_info(stream, bag_make, ki
 
 
 def test_keypoints_of_another_frame_than_the_cameras_are_noted(stream, make):
-    """In a frame that is not optical they would lie on their side; a CameraInfo that names none says nothing."""
-    odd = cloud(make, seen(persons_at((0, 0, 4))), frame="left_camera_frame")
+    """In a frame that is not optical they would lie on their side. A CameraInfo without a frame decides nothing."""
+    elsewhere = cloud(make, seen(persons_at((0, 0, 4))), frame="left_camera_frame")
     nameless = camera_info(make)
     nameless.header.frame_id = ""
     stream.camera_info(nameless)
-    stream.keypoints(CLOUD, odd)
+    stream.keypoints(CLOUD, elsewhere)
     assert not stream.ledger.notes
     stream.camera_info(camera_info(make))
     stream.keypoints(CLOUD, cloud(make, seen(persons_at((0, 0, 4)))))
     assert not stream.ledger.notes
-    assert stream.keypoints(CLOUD, odd).frame.lifted.ok.all() and stream.ledger.notes["another_frame"] == 1
+    assert stream.keypoints(CLOUD, elsewhere).frame.lifted.ok.all() and stream.ledger.notes["another_frame"] == 1
     assert "'left_camera_frame', CameraInfo's 'camera_color" in stream.ledger.advice["another_frame"]
 
 
@@ -245,7 +245,7 @@ def test_the_same_messages_give_the_same_bits(model_file, make):
 
 
 def superset_model(model_file, tmp_path):
-    """A model of all points of COCO-17 and BODY_25 and one more; its every shape is the fixture's."""
+    """Return a model of all points of COCO-17, BODY_25 and one more; it always has the fixture's shape."""
     from paul_ros.model import save_model, to_unit_size, weight_shapes
 
     coco, body = load_layout("coco17"), load_layout("body25")
@@ -275,7 +275,7 @@ def both(model_file, tmp_path):
 
 
 def finding(model, **given) -> LiftStream:
-    """A stream that nobody told the input's layout."""
+    """Return a stream that has to find the input's layout."""
     return LiftStream(Lifter(model), None, 0.3, 64, **given)
 
 
@@ -306,7 +306,7 @@ def message_type(message) -> str:
 
 
 def test_the_models_own_layout_goes_before_a_shipped_one_of_as_many_points(model_file, make):
-    """A model of 17 points of another kind of object: they are not taken for a person's."""
+    """A model of another object with 17 points: they are not taken for a person's."""
     model = load_model(model_file)
     door = Layout.from_dict({"name": "door", "names": [f"d{n}" for n in range(17)], "root": ["d0"]})
     stream = finding(replace(model, layout=door))
@@ -347,7 +347,7 @@ def test_what_is_published_may_be_another_layout(both, make, output, points):
 
 
 def test_points_that_the_model_lacks_are_never_published(stream, model_file, make):
-    """BODY_25 into a model of 17 points: those of the model come out; asked for by name they are refused."""
+    """BODY_25 into a model of 17 points gives the model's points; asking for BODY_25 is refused."""
     own = LiftStream(stream.lifter, load_layout("body25"), 0.3, 64)
     assert own.route.output.name == "coco17"
     with pytest.raises(LayoutError, match="has no left_big_toe.*'model'"):
@@ -415,6 +415,6 @@ def test_smoothing_is_off_until_it_is_set(stream, make):
     smooth, frames = answers(0.5)
     assert np.diff(smooth, 2, axis=0).std() < 0.6 * np.diff(raw, 2, axis=0).std()
     assert stream.describe()["smoothing_hz"] == 0.5
-    # Bodies and roots stand where the filtered points do.
+    # Roots follow the filtered points.
     np.testing.assert_allclose(frames[-1].lifted.root, smooth[-1][:, [11, 12]].mean(1))
     np.testing.assert_array_equal(answers(0.0)[0], raw)

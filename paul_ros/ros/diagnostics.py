@@ -3,10 +3,10 @@
 
 The levels, from the first that applies:
 
-- ERROR: the input cannot be read, the node itself failed since the last report, or no message since then was usable.
+- ERROR: the input cannot be read; or, since the last report, the node itself failed or could use no message.
 - STALE: keypoints came once, but none for STALE_SECONDS.
-- WARN: there are no keypoints (at all, or since the last report), something was dropped, a QoS does not match, the
-  keypoints' frame is not the camera's, most persons hardly fit the model, or a CameraInfo is missing for metres.
+- WARN: any of these was found since the last report. No keypoints came. Something was dropped. A QoS does not match.
+  The keypoints' frame is not the camera's. Most persons hardly fit the model. A CameraInfo is missing for metres.
 - OK: none of these.
 """
 

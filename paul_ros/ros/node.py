@@ -70,7 +70,7 @@ class LifterNode(LifecycleNode):
 
     @property
     def active(self) -> bool:
-        """Whether the node lifts."""
+        """True while the node lifts."""
         return self._pipeline is not None and self._pipeline.active
 
     def start(self) -> None:

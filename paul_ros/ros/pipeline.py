@@ -67,7 +67,7 @@ class Pipeline:
 
     @property
     def active(self) -> bool:
-        """Whether it subscribes and publishes."""
+        """True while it subscribes and publishes."""
         return bool(self._timers)
 
     def activate(self) -> None:

@@ -18,8 +18,8 @@ from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.reasons import REASONS
 
 SURFACE = 0.12
-"""Metres from the measured skin to the middle of a person's hips: half of the depth of adults there. That is about
-0.25 m (buttock depth; Gordon et al., 2012 Anthropometric Survey of U.S. Army Personnel, 2014)."""
+"""Metres from the measured skin to the middle of a person's hips: half of the depth of adults there, about 0.25 m.
+Source: buttock depth in Gordon et al., 2012 Anthropometric Survey of U.S. Army Personnel, 2014."""
 
 SIGMA = 0.08
 """Metres, standard deviation of SURFACE: hips seen from the side are half as broad as deep again, and clothes and arms

@@ -2,7 +2,7 @@
 """The one path from a 2D keypoint message to 3D; node and replay are thin shells over it.
 
 message -> adapter -> confidence threshold -> model's layout -> Lifter -> depth -> smoothing -> output layout -> Frame.
-No message may stop the stream: one that cannot be used is dropped, counted by its reason and explained.
+No message stops the stream: one that cannot be used is dropped, counted by its reason and explained.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 
 class Outcome(enum.Enum):
-    """What became of one message of keypoints.
+    """The fate of one message of keypoints.
 
     Attributes:
         LIFTED: the frame is this message's image.
@@ -101,13 +101,11 @@ def open_stream(
 
 
 class LiftStream:
-    """Lifts a stream of 2D keypoint messages, one image at a time.
+    """Lifts 2D keypoint messages, one image at a time, and each on its own unless `smoothing` is set.
 
-    Each image is lifted on its own, unless `smoothing` is set. A message of most types is an image. If a detector sends
-    one message per person, messages with equal stamps are grouped; a group closes with the first message of another
-    stamp, or by `flush`.
-
-    To change the model or a layout, open another stream with this one's session.
+    A message of most types is an image. If a detector sends one message per person, messages with equal stamps are
+    grouped; a group closes with the first message of another stamp, or by `flush`. To change the model or a layout,
+    open another stream with this one's session.
 
     Attributes:
         session: the camera, its depth images and all counts.
