@@ -217,6 +217,22 @@ def test_stamps_going_backwards_are_used_and_noted(stream, make):
     assert stream.ledger.notes == {"stamp_backwards": 1} and not stream.ledger.drops
 
 
+def test_answers_say_what_became_of_a_message(stream, bag_make):
+    """One person per message: kept, then lifted with the first message of the next image."""
+    pose = dict(zip(stream.route.given.names, seen(GOOD)[0].tolist()))
+
+    def send(ident: int, seconds: int):
+        return stream.keypoints(foreign.OPENDR, foreign.opendr(bag_make, header_of(bag_make, seconds), pose, ident))
+
+    kept = [send(1, 1), send(2, 1)]
+    assert [(answer.outcome, answer.frame) for answer in kept] == 2 * [(Outcome.KEPT, None)]
+    completed = send(1, 2)
+    assert completed.outcome is Outcome.COMPLETED and completed.frame.keypoints.ids == ("1", "2")
+    stream.max_persons = 1
+    assert send(2, 2).outcome is Outcome.DROPPED and stream.ledger.drops == {"too_many_persons": 1}
+    assert stream.flush().keypoints.ids == ("1",) and stream.flush() is None
+
+
 def test_a_fault_in_lifting_is_counted_and_its_traceback_logged_once(stream, make, monkeypatch, caplog):
     def fails(*_):
         raise ZeroDivisionError("on purpose")
@@ -386,6 +402,14 @@ def test_a_height_that_the_model_cannot_have_is_refused(model_file):
     with pytest.raises(ModelError):
         lifter.person_height = 1.2
     assert lifter.person_height == 0 and lifter.metres_per_unit == model.metres_per_unit
+
+
+@pytest.mark.parametrize(
+    "name, advice", [("smothing", "did you mean 'smoothing'"), ("zzz", "known are .*person_height")]
+)
+def test_unknown_parameters_are_refused(model_file, name, advice):
+    with pytest.raises(ParameterError, match=f"no parameter '{name}'; {advice}"):
+        open_stream(str(model_file), **{name: 5})
 
 
 def test_parameters_out_of_their_limits_are_refused(model_file):
