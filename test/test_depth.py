@@ -157,3 +157,22 @@ def test_replay_takes_the_depths_of_a_bag(model_file, tmp_path):
         bag.write("/keypoints", cloud(make, seen(truth)), 2)
     done = replay(tmp_path / "in.mcap", open_stream(str(model_file)))
     np.testing.assert_allclose(done.frames[0].lifted.points, truth, atol=0.03)
+
+
+def test_images_of_before_the_clock_was_set_back_are_forgotten(stream, make):
+    """A bag loops: the image of the first pass has the right stamp, but may show something else."""
+    stream.depth(depth_image(make, background(two()), header=header_of(make, seconds=9)))
+    stream.depth(depth_image(make, background(two()), header=header_of(make, seconds=7)))
+    stream.keypoints(CLOUD, cloud(make, seen(two()), seconds=9))
+    assert stream.ledger.notes == {"depth_of_another_time": 1}
+
+
+def test_the_root_of_a_thing_lies_on_its_visible_surface(model_file, make):
+    """A model without stature is no person's: no depth of hips is added."""
+    model = load_model(model_file)
+    del model.header["stature"]
+    stream = LiftStream(Lifter(model), None, 0.3, 64)
+    stream.camera_info(camera_info(make))
+    stream.depth(depth_image(make, np.full((480, 640), 4.0)))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame
+    np.testing.assert_allclose(frame.lifted.root[:, 2], 4.0)

@@ -115,6 +115,16 @@ def test_keypoints_of_another_frame_than_the_cameras_are_noted(stream, make):
     assert "'left_camera_frame', CameraInfo's 'camera_color" in stream.ledger.advice["another_frame"]
 
 
+def test_persons_that_hardly_fit_the_model_are_noted(stream, make, monkeypatch):
+    lift = stream.lifter.lift
+    monkeypatch.setattr(stream.lifter, "lift", lambda *given: replace(lift(*given), unexplained=np.array([0.49, 0.51])))
+    stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
+    assert stream.ledger.notes == {"unlike_the_model": 1}
+    assert (
+        "'stand'" in stream.ledger.advice["unlike_the_model"] and "`layout`" in stream.ledger.advice["unlike_the_model"]
+    )
+
+
 def test_persons_far_away_are_left_out_and_explained(stream, make):
     stream.camera_info(camera_info(make))
     stream.keypoints(CLOUD, cloud(make, seen(persons_at((0, 0, 4), (0, 0, 250), (0, 0, 2000)))))
