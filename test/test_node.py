@@ -239,6 +239,13 @@ def test_no_torch_in_the_node(bench):
     assert "min_confidence" in done.stdout
 
 
+def test_numpy_is_not_imported_before_the_process_limits_its_threads():
+    """`python -m` imports the packages around a module first."""
+    code = "import sys, paul_ros.ros; print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_camera_info_turns_model_units_into_metres(ros, start_lifter, model_file):
     bench = Bench(ros, start_lifter("-p", f"model:={model_file}"))
     bench.matched()

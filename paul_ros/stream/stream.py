@@ -28,10 +28,11 @@ from paul_ros.model import load_model
 from paul_ros.stream import advice
 from paul_ros.stream.depth import SURFACE
 from paul_ros.stream.frame import Frame
+from paul_ros.stream.layout_search import read_in_fitting_layout
 from paul_ros.stream.parameters import checked
 from paul_ros.stream.person_group import PersonGroup
 from paul_ros.stream.reasons import REASONS
-from paul_ros.stream.route import MODEL, Route, read_unknown
+from paul_ros.stream.route import MODEL, Route
 from paul_ros.stream.session import Session
 from paul_ros.stream.smoothing import OneEuro
 
@@ -39,9 +40,8 @@ _BONE_WIDTH = 0.01
 """Width of a drawn bone over the mean shape's largest extent."""
 
 _UNLIKE = 0.5
-"""Share of a person that the model does not explain, above which it is noted. Persons in the bags reach 0.37, with
-noise of 5 % of the height 0.42. If COCO's points are taken for Human3.6M's or the reverse, 97 % of the persons exceed
-0.5."""
+"""Unexplained share of a person above which it is noted. Persons in the bags reach 0.37, with noise of 5 % of the
+height 0.42. If COCO's points are taken for Human3.6M's or the reverse, 97 % of the persons exceed 0.5."""
 
 _log = logging.getLogger(__name__)
 
@@ -274,7 +274,7 @@ class LiftStream:
             keypoints = msg_adapters.read(type_name, msg, len(source.names), source)
             self._check_persons(keypoints.persons)
         else:
-            keypoints, found = read_unknown(self.lifter.model.layout, type_name, msg, source)
+            keypoints, found = read_in_fitting_layout(self.lifter.model.layout, type_name, msg, source)
             self._check_persons(keypoints.persons)
             route = Route.between(found, self.lifter.model.layout, self._output_layout)
             if keypoints.visible.any():
