@@ -216,7 +216,7 @@ def test_the_same_path_is_read_anew(managed, model_file, other_model, tmp_path):
 def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeypatch, other_model, model_file):
     from foreign_messages import OPENDR, LiveMake, opendr
     from rclpy.parameter import Parameter
-    from test_node import POSES
+    from test_pipeline import POSES
 
     from paul_ros.ros.node import LifterNode
 

@@ -184,26 +184,25 @@ _ALL = (
     Reason(
         "person_too_few_points",
         PERSON,
-        "Too few keypoints of a person are visible, so it is left out of the outputs",
+        "A person is left out of the outputs: too few of its keypoints are visible",
         "Lower the parameter `min_confidence` if the detector is unsure of points that are right.",
     ),
     Reason(
         "person_degenerate_points",
         PERSON,
-        "The keypoints of a person lie on one line, in two places or within about a pixel, so it is left out of the "
-        "outputs",
+        "A person is left out of the outputs: its keypoints lie on one line, in two places or within about a pixel",
         "Use a larger image if persons are far away; otherwise check the detector.",
     ),
     Reason(
         "person_too_far",
         PERSON,
-        f"A person would stand more than {MAX_DISTANCE:.0f} m away, so it is left out of the outputs",
+        f"A person is left out of the outputs: it would stand more than {MAX_DISTANCE:.0f} m away",
         "Check camera_info if the person is nearer.",
     ),
     Reason(
         "person_behind_camera",
         PERSON,
-        "A person would stand beside or behind the camera, so it is left out of the outputs",
+        "A person is left out of the outputs: it would stand beside or behind the camera",
         "Check camera_info and the layout of the keypoints.",
     ),
     # --- notes

@@ -313,15 +313,15 @@ class LiftStream:
         used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))
         metres_per_unit = self.lifter.metres_per_unit if lifted.units == "m" else None
         return Frame(
-            header,
-            route.keypoints_out(used),
-            route.lifted_out(lifted),
-            route.output,
-            given,
-            self._bone_width * (metres_per_unit or 1.0),
-            self.intrinsics,
-            lifted.points,
-            self._axis_measures,
+            header=header,
+            keypoints=route.keypoints_out(used),
+            lifted=route.lifted_out(lifted),
+            layout=route.output,
+            given=given,
+            bone_width=self._bone_width * (metres_per_unit or 1.0),
+            camera=self.intrinsics,
+            model_points=lifted.points,
+            axis_measures=self._axis_measures,
         )
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:
