@@ -118,7 +118,7 @@ class Health:
         if self._messages and not self._frames and _dropped_messages(drops) >= self._messages:
             return ERROR, f"no message could be used; dropped: {listed(drops)}"
         if silence is not None and silence >= STALE_SECONDS:
-            return STALE, f"no keypoints for {silence:.0f} s"
+            return STALE, f"no keypoints for {silence:.0f} s; check the detector"
         warnings = list(self._warnings(drops, silence, stream))
         summary = f"{self._frames} frames since the last report, units: {stream.units}"
         return (WARN, "; ".join([*warnings, summary])) if warnings else (OK, summary)
@@ -131,14 +131,14 @@ class Health:
         if drops:
             yield f"dropped: {listed(drops)}"
         if self._mismatches:
-            yield f"{self._mismatches} endpoints with a QoS that does not match"
+            yield f"{self._mismatches} endpoints with a QoS that does not match, see the log"
         notes = Counter(stream.ledger.notes) - self._old_notes
         if notes["another_frame"]:
             yield stream.ledger.advice["another_frame"]
         if notes["unlike_the_model"] > MOST_PERSONS * self._persons_lifted():
             yield stream.ledger.advice["unlike_the_model"]
         if lacks_camera_info(stream) and self._frames:
-            yield "no metres, for no usable CameraInfo has come"
+            yield "no metres without a usable CameraInfo, remap `camera_info`"
 
     def _values(self, now: float, silence: float | None, stream: LiftStream, input_type: str) -> dict[str, Any]:
         elapsed = max(now - self._last_report, 1e-9)

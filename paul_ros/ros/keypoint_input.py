@@ -176,7 +176,12 @@ class KeypointInput:
         if not msg.ids:
             self._listener.on_no_bodies()
         if ignored := self._bodies.update(msg.ids, self._listener.max_bodies()):
-            self._warn("bodies", f"bodies that are not read, by their ids: {', '.join(map(repr, ignored[:5]))}")
+            names = ", ".join(map(repr, ignored[:5]))
+            self._warn(
+                "bodies",
+                f"bodies that are not read, by their ids: {names}. Raise `max_persons`, or publish ids that a topic's "
+                "name may hold.",
+            )
 
     def _subscribe_body(self, topic: str) -> Subscription:
         return self._node.create_subscription(message_class(BODY), topic, self._reader(BODY, topic), input_qos())
