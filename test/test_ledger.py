@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-from paul_ros import lifter
+from paul_ros.lifter import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS
 from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.reasons import DROP, NOTE, PERSON, REASONS
 
@@ -61,10 +61,7 @@ def used_reasons() -> Iterator[tuple[str, Path]]:
 
 
 #: The lifter's own reasons become those of persons.
-OF_PERSONS = {
-    f"person_{reason}"
-    for reason in (lifter.TOO_FEW_POINTS, lifter.DEGENERATE_POINTS, lifter.TOO_FAR, lifter.BEHIND_CAMERA)
-}
+OF_PERSONS = {f"person_{reason}" for reason in (TOO_FEW_POINTS, DEGENERATE_POINTS, TOO_FAR, BEHIND_CAMERA)}
 
 
 def test_the_table_has_every_reason_that_is_used_and_no_other():

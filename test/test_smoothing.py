@@ -7,19 +7,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import PERSON
+from conftest import PERSON, coco_model
 
-from paul_ros.lifter import _nothing
+from paul_ros.lifter import Lifter
 from paul_ros.stream.smoothing import FORGET_SECONDS, OneEuro
 
 HIPS = (11, 12)
 FRAME = 33_333_333  # ns
 
 
+LIFTER = Lifter(coco_model())
+
+
+def nobody(persons: int, units: str):
+    """Return persons that were not lifted."""
+    return replace(LIFTER.lift(np.zeros((persons, 17, 2)), np.zeros((persons, 17), bool)), units=units)
+
+
 def lifted(points: np.ndarray, units: str = "m"):
     """Return persons (N,17,3) as the Lifter does."""
-    nobody = _nothing(len(points), 17, units)
-    return replace(nobody, points=points, root=points[:, HIPS].mean(1), reason=("",) * len(points))
+    return replace(nobody(len(points), units), points=points, root=points[:, HIPS].mean(1), reason=("",) * len(points))
 
 
 def run(filtered: OneEuro, frames: np.ndarray, ids=("1",), start: int = 0) -> np.ndarray:
@@ -86,7 +93,7 @@ def test_persons_without_an_id_or_not_lifted_are_as_they_were():
     np.testing.assert_array_equal(run(OneEuro(1.0), raw, ("",)), raw)
     filtered = OneEuro(1.0)
     for n in range(3):
-        assert np.isnan(filtered(("1",), n * FRAME, _nothing(1, 17, "m"), HIPS).points).all()
+        assert np.isnan(filtered(("1",), n * FRAME, nobody(1, "m"), HIPS).points).all()
 
 
 def test_the_root_is_that_of_the_filtered_points():
