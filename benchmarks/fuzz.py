@@ -59,7 +59,8 @@ from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model, weight_shapes
 from paul_ros.offline.bag import BagMessages, BagWriter, read_records
 from paul_ros.offline.replay import Topics, evaluate, replay
-from paul_ros.stream.stream import PACKED, LiftStream
+from paul_ros.stream.messages import MessageBuilder
+from paul_ros.stream.stream import LiftStream
 
 SESSION = 25  # cases
 BODIES = "/humans/bodies/{}/skeleton2d"
@@ -346,7 +347,8 @@ class Bench:
         self.tiny = tiny_model(folder)
         self.whole_bags = [tiny_bag(folder / f"{name}.mcap", self.bag, name) for name in ("none", "lz4", "zstd")]
 
-        self.writers = {name: make() for name, make in PACKED.items()}  # as in a node, one of each for all frames
+        # As in a node, one of each for all frames.
+        self.objects, self.packed = MessageBuilder(self.bag), MessageBuilder(self.bag, packed=True)
 
     def again(self, message, data: bytes) -> bytes:
         """Bytes of a message of the same type, read and written anew: padding may be anything."""
@@ -416,7 +418,7 @@ def message_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, 
         else:
             msg = BUILDERS[type_name](make, header(make, rng, stamp), poses, rng)
         spoil(msg, rng)
-        before = Counter(stream.drops)
+        before = Counter(stream.ledger.drops)
         start = time.process_time()
         try:
             if kind == "camera":
@@ -425,17 +427,17 @@ def message_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, 
                 stream.depth(msg)
             else:
                 topic = BODIES.format(rng.choice("abc")) if type_name == foreign.HRI else ""
-                frame = stream.keypoints(type_name, msg, topic)
+                answer = stream.keypoints(type_name, msg, topic)
                 sent += 1
-                use(frame, stream, bench, rng)
+                use(answer.frame, stream, bench, rng)
         except Exception:
             tally.crash(f"{where} {type_name} {kind}")
         tally.cases += 1
         tally.slowest_ms = max(tally.slowest_ms, 1000 * (time.process_time() - start))
-        new = stream.drops - before
+        new = Counter(stream.ledger.drops) - before
         tally.reasons += new
         if strict and new["internal_error"]:
-            tally.crash(f"{where} {type_name} {kind} internal_error {stream.explanations['internal_error']}")
+            tally.crash(f"{where} {type_name} {kind} internal_error {stream.ledger.advice['internal_error']}")
         dropped = sum(new.values()) - persons_in(new)
         tally.refused += dropped > 0
         tally.accepted += not dropped
@@ -458,23 +460,30 @@ def use(frame, stream: LiftStream, bench: Bench, rng: random.Random) -> None:
     finite(frame)
     if rng.random() < 0.1:
         with stream.guard():
-            for output, message in frame.messages(bench.bag).items():
+            packed = bench.packed.messages(frame)
+            for output, message in bench.objects.messages(frame).items():
                 data = bench.bag.serialise(message)
-                if output in PACKED and bench.again(message, frame.serialised(output, bench.writers[output])) != data:
+                if isinstance(packed[output], bytes) and bench.again(message, packed[output]) != data:
                     raise Wrong(f"{output} is another as bytes")
 
 
 def count_lost(stream: LiftStream, sent: int, single: bool, tally: Tally, where: str) -> None:
     """Every message is a frame, a person of one, or a drop; every person of a frame is lifted or a drop."""
-    persons = persons_in(stream.drops)
-    inputs = stream.drops["bad_intrinsics"] + stream.drops["depth_encoding"] + stream.drops["truncated_data"]
-    counts, messages = stream.counts, sum(stream.drops.values()) - persons
+    persons = persons_in(stream.ledger.drops)
+    inputs = (
+        stream.ledger.drops["bad_intrinsics"]
+        + stream.ledger.drops["depth_encoding"]
+        + stream.ledger.drops["truncated_data"]
+    )
+    counts, messages = stream.counts, sum(stream.ledger.drops.values()) - persons
     if counts["lifted"] + persons != counts["persons"]:
         tally.lost(where, f"{counts['persons']} persons, {counts['lifted']} lifted, {persons} dropped")
     kept = counts["persons"] if single else counts["frames"]
     # Cameras and depth images share the reasons; the bound is exact where none was dropped.
-    if not sent <= kept + messages or (not inputs and not stream.drops["internal_error"] and kept + messages != sent):
-        tally.lost(where, f"{sent} messages, {kept} kept, {messages} dropped: {dict(stream.drops)}")
+    if not sent <= kept + messages or (
+        not inputs and not stream.ledger.drops["internal_error"] and kept + messages != sent
+    ):
+        tally.lost(where, f"{sent} messages, {kept} kept, {messages} dropped: {dict(stream.ledger.drops)}")
 
 
 def fields_session(bench, rng, tally, cases, where):
@@ -495,23 +504,23 @@ def cdr_session(bench, rng, tally, cases, where):
     for _ in range(cases):
         data = rng.choice(whole) if rng.random() < 0.1 else break_bytes(rng.choice(whole), rng)
         tally.cases += 1
-        start, before = time.process_time(), Counter(stream.drops)
+        start, before = time.process_time(), Counter(stream.ledger.drops)
         try:
             same_as_rosbags(bench, data, reader)
-            use(stream.keypoints(foreign.CLOUD, data), stream, bench, rng)
+            use(stream.keypoints(foreign.CLOUD, data).frame, stream, bench, rng)
         except Exception:
             tally.crash(where)
         tally.slowest_ms = max(tally.slowest_ms, 1000 * (time.process_time() - start))
-        new = stream.drops - before
+        new = Counter(stream.ledger.drops) - before
         tally.reasons += new
         if new["internal_error"]:
-            tally.crash(f"{where} internal_error {stream.explanations['internal_error']}")
+            tally.crash(f"{where} internal_error {stream.ledger.advice['internal_error']}")
         dropped = sum(new.values()) - persons_in(new)
         tally.refused += dropped > 0
         tally.accepted += not dropped
-    persons = persons_in(stream.drops)
-    if stream.counts["frames"] + sum(stream.drops.values()) - persons != cases:
-        tally.lost(where, f"{cases} messages, {stream.counts['frames']} frames, {dict(stream.drops)}")
+    persons = persons_in(stream.ledger.drops)
+    if stream.counts["frames"] + sum(stream.ledger.drops.values()) - persons != cases:
+        tally.lost(where, f"{cases} messages, {stream.counts['frames']} frames, {dict(stream.ledger.drops)}")
 
 
 def same_as_rosbags(bench: Bench, data: bytes, reader: CloudReader) -> None:
@@ -560,9 +569,9 @@ def bag_session(bench, rng, tally, cases, where):
             done = replay(path, stream, bench.folder / "out.mcap" if rng.random() < 0.1 else None, Topics())
             json.dumps(evaluate(done), allow_nan=False)
             tally.accepted += 1
-            persons = persons_in(stream.drops)
+            persons = persons_in(stream.ledger.drops)
             keypoints = sum(matches_keypoints(path))
-            counted = stream.counts["frames"] + sum(stream.drops.values()) - persons
+            counted = stream.counts["frames"] + sum(stream.ledger.drops.values()) - persons
             if done.damage is None and counted < keypoints:
                 tally.lost(where, f"{keypoints} keypoint messages of {read}, {counted} counted")
         except (BagError, LayoutError) as error:

@@ -26,6 +26,8 @@ from foreign_messages import DEFINITIONS
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROOT = Path(__file__).resolve().parent.parent
+#: The command of the node's process.
+LIFTER = [sys.executable, "-m", "paul_ros.ros.lifter_process"]
 
 
 class RosMake:
@@ -196,7 +198,7 @@ class LifterProcess:
         env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
         with open(self._log, "wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "paul_ros.ros.node", "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
+                [*LIFTER, "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
                 cwd=ROOT,
                 env=env,
                 stdout=log,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The other side of the node under test: a publisher and listener, and the messages that it sends."""
+"""The counterpart of the node under test: a publisher and listener, and its messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from conftest import LifterProcess, RosMake, header_of, persons_at, seen
 
 from msg_adapters import outputs
-from paul_ros.stream.stream import OUTPUTS
+from paul_ros.stream.messages import OUTPUTS, STANDARD
 
 MAKE = RosMake()
 GOOD = persons_at((0.3, 0, 4))
@@ -18,7 +18,7 @@ PATIENCE = 60.0
 
 
 class Bench:
-    """The other side: publishes to one lifter and keeps what it says, by output name."""
+    """Publishes to one lifter and keeps its answers by output name."""
 
     def __init__(
         self, ros, lifter: LifterProcess, kind: str = "sensor_msgs/msg/PointCloud2", best_effort: bool = False
@@ -29,7 +29,7 @@ class Bench:
 
         self.ros, self.lifter, self.stamp = ros, lifter, 100_000
         self.node = ros.create_node("bench", namespace=lifter.namespace)
-        self.got = {name: [] for name in (*OUTPUTS, "layout", "diagnostics")}
+        self.got = {name: [] for name in (*STANDARD, "layout", "diagnostics")}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         self.keypoints = self.node.create_publisher(
@@ -37,8 +37,9 @@ class Bench:
         )
         self.camera = self.node.create_publisher(class_of("sensor_msgs/msg/CameraInfo"), "camera_info", 10)
         self.depth = self.node.create_publisher(class_of("sensor_msgs/msg/Image"), "depth", 10)
-        for name, type_name in OUTPUTS.items():
-            self.node.create_subscription(class_of(type_name), f"lifter/{name}", self.got[name].append, 10)
+        for name in STANDARD:
+            kind = class_of(OUTPUTS[name].message_type)
+            self.node.create_subscription(kind, f"lifter/{name}", self.got[name].append, 10)
         self.node.create_subscription(String, "lifter/layout", self.got["layout"].append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
 
@@ -52,7 +53,7 @@ class Bench:
                 self.got["diagnostics"].append((stamp.sec * 10**9 + stamp.nanosec, status))
 
     def until(self, condition, what: str) -> None:
-        """Waits for a condition while messages come in; fails with the node's log."""
+        """Wait for a condition while messages come in; fail with the node's log."""
         end = time.monotonic() + PATIENCE
         while not condition():
             assert self.lifter.process.poll() is None, f"the node ended\n{self.lifter.log()}"
@@ -60,7 +61,7 @@ class Bench:
             self.ros.spin_once(self.node, timeout_sec=0.02)
 
     def matched(self) -> None:
-        """Until publishers and subscribers of both sides know each other: all outputs answer probes."""
+        """Wait until both sides have found each other and all outputs answer."""
         self.until(
             lambda: all(p.get_subscription_count() for p in (self.keypoints, self.camera, self.depth)),
             "subscriptions of the node",
@@ -68,18 +69,18 @@ class Bench:
 
         def answered():
             self.send(nobody())
-            return all(self.got[name] for name in (*OUTPUTS, "layout"))
+            return all(self.got[name] for name in (*STANDARD, "layout"))
 
         self.until(answered, "answers on all outputs")
 
     def send(self, fill) -> int:
-        """Publishes fill(header) with a stamp of its own; returns the stamp's seconds."""
+        """Publish fill(header) with a new stamp; return the stamp's seconds."""
         self.stamp += 1
         self.keypoints.publish(fill(header_of(MAKE, seconds=self.stamp)))
         return self.stamp
 
     def answer(self, name: str, seconds: int):
-        """The output with this stamp."""
+        """Wait for the output with this stamp and return it."""
 
         def stamped():
             return [msg for msg in self.got[name] if header_in(msg).stamp.sec == seconds]
@@ -88,7 +89,7 @@ class Bench:
         return stamped()[0]
 
     def lifts(self) -> np.ndarray:
-        """A good frame is answered by its persons, (N, 17, 3)."""
+        """Send a good frame and return the persons of its answer, (N, 17, 3)."""
         poses = self.answer("poses", self.send(good())).poses
         assert len(poses) == 17
         return np.array([(p.position.x, p.position.y, p.position.z) for p in poses]).reshape(-1, 17, 3)
@@ -100,7 +101,7 @@ class Bench:
         return self.layout()["units"]
 
     def next_diagnostics(self):
-        """The first status that was made after now; one may be on its way already."""
+        """Return the first status made after now; an older one may be on its way."""
         now, got = time.time_ns(), self.got["diagnostics"]
         self.until(lambda: got and got[-1][0] > now, "diagnostics")
         return got[-1][1]
@@ -118,7 +119,7 @@ def class_of(type_name: str) -> type:
 
 
 def cloud(xy: np.ndarray, **changes):
-    """header -> a keypoint cloud with some of its fields changed."""
+    """Return a function header -> keypoint cloud, with some of its fields changed."""
 
     def fill(header):
         ids = [str(person) for person in range(len(xy))]
@@ -139,7 +140,7 @@ def nobody():
 
 
 def set_parameters(bench, **values):
-    """Sets parameters over their service; the reason why each was refused, '' where it was accepted."""
+    """Set parameters over their service; return the reason of each refusal, '' if it was accepted."""
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images: read as they are, used where they tell the root's distance, ignored with a reason where they do not."""
+"""Depth images place persons if they show the root's distance; otherwise they are ignored with a reason."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
 def depth_image(make, metres: np.ndarray, encoding: str = "32FC1", big: bool = False, pad: int = 0, **changes):
-    """(H,W) metres as a message; pad: bytes after every row."""
+    """Return (H,W) metres as a message with `pad` bytes after every row."""
     form, unit = ("f4", 1.0) if encoding == "32FC1" else ("u2", 0.001)
     rows = np.nan_to_num(metres / unit, nan=np.nan if form == "f4" else 0).astype((">" if big else "<") + form)
     height, width = metres.shape
@@ -77,12 +77,12 @@ def stream(model_file, make) -> LiftStream:
 
 
 def two(scale: float = 1.0) -> np.ndarray:
-    """Two persons, so many times as large and as far away as they are taken for."""
+    """Return two persons, `scale` times as large and as far away as the model assumes."""
     return scale * persons_at((0.3, 0, 4), (-1, 0.1, 5))
 
 
 def background(points: np.ndarray, wall: float = 9.0) -> np.ndarray:
-    """The depths (480,640) of persons, flat and as broad as their hips, before a wall."""
+    """Return the depths (480,640) of a wall and of persons before it, flat and as broad as their hips."""
     metres = np.full((480, 640), wall)
     for x, y, z in points[:, [11, 12]].mean(1):
         u, v, r = FOCAL * x / z + CENTRE[0], FOCAL * y / z + CENTRE[1], 0.2 * FOCAL / z
@@ -98,11 +98,11 @@ def cloud(make, xy, **stamp):
 def test_persons_of_any_size_stand_where_they_are_measured(stream, make, scale):
     truth = two(scale)
     stream.depth(depth_image(make, background(truth)))
-    frame = stream.keypoints(CLOUD, cloud(make, seen(truth)))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(truth))).frame
     np.testing.assert_allclose(frame.lifted.points, truth, atol=0.03)
     np.testing.assert_allclose(frame.lifted.root, truth[:, [11, 12]].mean(1), atol=0.03)
     np.testing.assert_array_equal(frame.lifted.distance_sigma, SIGMA)
-    assert stream.notes == {"depth_used": 2} and not stream.drops
+    assert stream.ledger.notes == {"depth_used": 2} and not stream.ledger.drops
 
 
 @pytest.mark.parametrize(
@@ -114,39 +114,39 @@ def test_persons_of_any_size_stand_where_they_are_measured(stream, make, scale):
     ],
 )
 def test_what_is_no_measure_of_the_person_changes_nothing(stream, make, metres, note):
-    plain = stream.keypoints(CLOUD, cloud(make, seen(two())))
+    plain = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame
     stream.depth(depth_image(make, metres))
-    frame = stream.keypoints(CLOUD, cloud(make, seen(two())))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame
     np.testing.assert_array_equal(frame.lifted.points, plain.lifted.points)
     np.testing.assert_array_equal(frame.lifted.distance_sigma, plain.lifted.distance_sigma)
-    assert stream.notes == note
-    assert ("remap `depth`" in str(stream.explanations)) == ("depth_of_another_size" in note)
+    assert stream.ledger.notes == note
+    assert ("Remap `depth`" in str(stream.ledger.advice)) == ("depth_of_another_size" in note)
 
 
 def test_only_the_image_of_that_time_counts(stream, make):
     truth = two(0.7)
     stream.depth(depth_image(make, background(truth)))
-    late = stream.keypoints(CLOUD, cloud(make, seen(truth), seconds=7, nanoseconds=40_000_000))
-    assert stream.notes == {"depth_of_another_time": 1} and late.lifted.root[0, 2] > 1.2 * truth[0, 11, 2]
-    assert "same clock" in stream.explanations["depth_of_another_time"]
+    late = stream.keypoints(CLOUD, cloud(make, seen(truth), seconds=7, nanoseconds=40_000_000)).frame
+    assert stream.ledger.notes == {"depth_of_another_time": 1} and late.lifted.root[0, 2] > 1.2 * truth[0, 11, 2]
+    assert "same clock" in stream.ledger.advice["depth_of_another_time"]
     for seconds in range(8, 20):
         stream.depth(depth_image(make, background(truth), header=header_of(make, seconds=seconds)))
     stream.keypoints(CLOUD, cloud(make, seen(truth), nanoseconds=10_000_000))
-    assert stream.notes["depth_used"] == 2
+    assert stream.ledger.notes["depth_used"] == 2
 
 
 def test_persons_that_were_not_lifted_are_no_fault(stream, make):
     xy = seen(two())
     xy[0, 2:] = np.nan
     stream.depth(depth_image(make, background(two())))
-    frame = stream.keypoints(CLOUD, cloud(make, xy))
-    assert frame.lifted.ok.tolist() == [False, True] and "internal_error" not in stream.drops
-    assert stream.notes == {"depth_used": 1}
+    frame = stream.keypoints(CLOUD, cloud(make, xy)).frame
+    assert frame.lifted.ok.tolist() == [False, True] and "internal_error" not in stream.ledger.drops
+    assert stream.ledger.notes == {"depth_used": 1}
 
 
 def test_an_unusable_image_is_a_counted_drop(stream, make):
     stream.depth(depth_image(make, np.ones((4, 4)), encoding="16UC1", step=1))
-    assert stream.drops == {"truncated_data": 1}
+    assert stream.ledger.drops == {"truncated_data": 1}
 
 
 def test_replay_takes_the_depths_of_a_bag(model_file, tmp_path):
@@ -157,3 +157,22 @@ def test_replay_takes_the_depths_of_a_bag(model_file, tmp_path):
         bag.write("/keypoints", cloud(make, seen(truth)), 2)
     done = replay(tmp_path / "in.mcap", open_stream(str(model_file)))
     np.testing.assert_allclose(done.frames[0].lifted.points, truth, atol=0.03)
+
+
+def test_images_of_before_the_clock_was_set_back_are_forgotten(stream, make):
+    """A bag loops: the image of the first pass has the right stamp, but may show something else."""
+    stream.depth(depth_image(make, background(two()), header=header_of(make, seconds=9)))
+    stream.depth(depth_image(make, background(two()), header=header_of(make, seconds=7)))
+    stream.keypoints(CLOUD, cloud(make, seen(two()), seconds=9))
+    assert stream.ledger.notes == {"depth_of_another_time": 1}
+
+
+def test_the_root_of_a_thing_lies_on_its_visible_surface(model_file, make):
+    """A model without stature is no person's: no depth of hips is added."""
+    model = load_model(model_file)
+    del model.header["stature"]
+    stream = LiftStream(Lifter(model), None, 0.3, 64)
+    stream.camera_info(camera_info(make))
+    stream.depth(depth_image(make, np.full((480, 640), 4.0)))
+    frame = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame
+    np.testing.assert_allclose(frame.lifted.root[:, 2], 4.0)

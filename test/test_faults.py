@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong around the node and while recording: publishers that die, floods, full disks, kills."""
+"""Faults around the node and while recording: publishers that die, floods, full disks, kills."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from paul_ros.errors import BagError
 from paul_ros.offline.bag_reader import read_messages, topics_of
 
 ONE = ROOT / "bags/one_person.mcap"
-#: Publishes a good cloud at RATE Hz, its stamps from FIRST on, COUNT times once the node has answered one.
+#: Publishes a good cloud COUNT times at RATE Hz with stamps from FIRST on, after the node has answered one.
 PUBLISHER = """
 import os, sys, time
 domain = os.environ["ROS_DOMAIN_ID"]
@@ -56,7 +56,7 @@ for _ in range(count):
     publish()
     due += 1 / rate
     time.sleep(max(due - time.monotonic(), 0))
-# What was lost shows when the next comes.
+# A loss shows when the next message comes.
 for _ in range(5):
     time.sleep(0.1)
     publish()
@@ -66,20 +66,20 @@ rclpy.spin(node)
 
 
 class Publisher:
-    """A publisher as a process of its own; stamps in seconds from `first` on."""
+    """A publisher in its own process; its stamps count seconds from `first` on."""
 
     def __init__(self, namespace: str, rate: float, first: int, count: int) -> None:
         env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
         env["PYTHONPATH"] = os.pathsep.join((str(ROOT), str(ROOT / "test"), env.get("PYTHONPATH", "")))
-        # A process that is killed leaves its shared memory behind.
+        # A killed process would leave shared memory behind.
         env["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
         arguments = [namespace, *map(str, (rate, first, count))]
         self.process = subprocess.Popen(
             [sys.executable, "-c", PUBLISHER, *arguments], cwd=ROOT, env=env, stdout=subprocess.PIPE, text=True
         )
 
-    def said(self) -> int:
-        """The next number that it prints."""
+    def next_count(self) -> int:
+        """Return the next number that it prints."""
         return int(self.process.stdout.readline())
 
     def kill(self) -> None:
@@ -103,7 +103,7 @@ def start_publisher():
 
 
 def heard(bench: Bench, first: int) -> list[int]:
-    """Stamps of the poses from one publisher."""
+    """Return the stamps of the poses that answer one publisher."""
     seconds = (message.header.stamp.sec for message in bench.got["poses"])
     return [second for second in seconds if first <= second < first + 1_000_000]
 
@@ -117,7 +117,7 @@ def bench(ros, start_lifter, model_file):
 
 
 def settled(bench: Bench) -> dict:
-    """Diagnostics once no more frames come."""
+    """Return diagnostics after the last frame has been lifted."""
     before = None
     while (now := bench.diagnosed())["frames"] != before:
         before = now["frames"]
@@ -132,13 +132,13 @@ def test_a_publisher_that_is_killed_and_another_that_comes(bench, start_publishe
     bench.until(lambda: len(heard(bench, 2_000_000)) > 20, "answers to the second")
     found = bench.diagnosed()
     assert "dropped_internal_error" not in found
-    # The second's numbers start again at one: that is no loss.
+    # The second publisher's sequence numbers start at one again: that is no loss.
     assert int(found.get("dropped_missed", 0)) < int(found["frames"])
     bench.lifts()
 
 
 def test_two_publishers_at_once_are_both_lifted(bench, start_publisher):
-    """A mistake of the user's, as where a detector was started twice: nothing breaks and no loss is made up."""
+    """A detector that was started twice by mistake breaks nothing, and no loss is invented."""
     firsts = (1_000_000, 2_000_000)
     for first in firsts:
         start_publisher(bench.lifter.namespace, 50, first, 10**6)
@@ -152,25 +152,25 @@ def test_two_publishers_at_once_are_both_lifted(bench, start_publisher):
 
 @pytest.mark.parametrize("silent", [0, 1], ids=["alone", "beside one that is silent"])
 def test_a_flood_into_a_slow_subscriber_loses_nothing_uncounted(bench, start_publisher, silent):
-    """1000 Hz are more than one core may manage, and this process takes a message every 20 ms."""
+    """One core may not manage 1000 Hz, and this process takes one message every 20 ms."""
     if not silent:
         bench.node.destroy_publisher(bench.keypoints)
     flood = start_publisher(bench.lifter.namespace, 1000, 1_000_000, 1500)
-    warm = flood.said()
+    warm = flood.next_count()
     while flood.process.poll() is None and len(heard(bench, 1_001_500)) < 2:
         time.sleep(0.02)
         bench.ros.spin_once(bench.node, timeout_sec=0)
-    sent = flood.said()
+    sent = flood.next_count()
     found = settled(bench)
     frames, missed = int(found["frames"]), int(found.get("dropped_missed", 0))
-    # One gap is taken for the first number of the other publisher; it is less than what waits in between.
+    # One gap may be taken for the first number of the other publisher; a gap is shorter than the queues.
     assert sent - warm - 50 * silent < frames + missed <= sent, found
     assert frames > 200 and "dropped_internal_error" not in found
 
 
 @pytest.mark.parametrize("topic", ["keypoints", "camera", "depth"])
 def test_bytes_that_are_no_message_do_not_stop_the_node(bench, topic):
-    """As of a publisher whose definition of the type is another."""
+    """As from a publisher with another definition of the type."""
     from rclpy.serialization import serialize_message
 
     publisher = getattr(bench, topic)
@@ -195,7 +195,7 @@ REPLAY = [sys.executable, "-m", "paul_ros.cli", "replay", str(ONE), "-o"]
 
 
 def recorded(path: Path) -> int:
-    """Messages that come out of a file that may end anywhere."""
+    """Return the number of messages read from a file that may end anywhere."""
     count = 0
     try:
         for _ in read_messages(path):
@@ -206,7 +206,7 @@ def recorded(path: Path) -> int:
 
 
 def recovered(path: Path) -> int:
-    """The same by mcap's own reader of streams, which is what tools for recovery are made of."""
+    """The same by mcap's stream reader, which recovery tools are made of."""
     count = 0
     with open(path, "rb") as stream:
         try:
@@ -218,7 +218,7 @@ def recovered(path: Path) -> int:
 
 
 def on_a_full_disk(code: str, *arguments: object) -> subprocess.CompletedProcess:
-    """Python code in a process that may write no file larger than 300 kB: that limit stands for the disk's."""
+    """Run Python code in a process that cannot write more than 300 kB to a file, as on a full disk."""
     limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n" + code
     command = [sys.executable, "-c", limited, *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
@@ -253,15 +253,15 @@ def test_a_recording_that_is_killed_is_readable(tmp_path, kind):
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background has it ignored
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # background jobs ignore it
     )
     end = time.monotonic() + PATIENCE
     while not (part.exists() and part.stat().st_size > 300_000):
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.001)
     process.send_signal(kind)
-    _, said = process.communicate(timeout=PATIENCE)
-    assert process.returncode != 0 and not out.exists() and "Traceback" not in said
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode != 0 and not out.exists() and "Traceback" not in errors
     if kind == signal.SIGINT:
         assert not part.exists()
         return

@@ -151,7 +151,7 @@ def test_a_bag_of_every_family_is_lifted_in_metres(tmp_path, model_file, name):
     """Without a word on the layout: it is found, and of the family's points those are given that the model has."""
     bag = write(tmp_path / "in.mcap", name)
     done = replay(bag, open_stream(str(model_file)), tmp_path / "out.mcap", topics_for(name))
-    assert not done.stream.drops and done.damage is None
+    assert not done.stream.ledger.drops and done.damage is None
     assert [frame.stamp for frame in done.frames] == [n * 10**9 + 5 for n in range(1, FRAMES + 1)]
     for frame, pixels in zip(done.frames, PIXELS):
         np.testing.assert_allclose(frame.given.xy, pixels, atol=1e-3)
@@ -185,8 +185,8 @@ def test_one_of_several_bodies(tmp_path, model_file):
 def test_hri_without_a_camera_is_dropped_and_explained(tmp_path, model_file):
     stream = open_stream(str(model_file))
     done = replay(write(tmp_path / "in.mcap", "hri", with_camera=False), stream, topics=Topics(keypoints=BODIES))
-    assert not done.frames and stream.drops == {"no_image_size": 2 * FRAMES}
-    assert "CameraInfo" in stream.explanations["no_image_size"]
+    assert not done.frames and stream.ledger.drops == {"no_image_size": 2 * FRAMES}
+    assert "CameraInfo" in stream.ledger.advice["no_image_size"]
 
 
 def test_persons_before_the_damage_of_a_bag_are_lifted(tmp_path, model_file):
@@ -231,7 +231,7 @@ def send(stream, make, ident: int, seconds: int = 1, frame: str = "camera", nano
     """One OpenDR person, who stands where nobody else does."""
     header = header_of(make, seconds, nanoseconds, frame)
     (pose,) = poses_of(seen(persons_at((0.2 * ident, 0, 4))).round())
-    return stream.keypoints(foreign.OPENDR, make.through_cdr(foreign.opendr(make, header, pose, ident)))
+    return stream.keypoints(foreign.OPENDR, make.through_cdr(foreign.opendr(make, header, pose, ident))).frame
 
 
 def test_persons_of_one_stamp_are_one_frame(stream, make):
@@ -242,7 +242,7 @@ def test_persons_of_one_stamp_are_one_frame(stream, make):
     np.testing.assert_allclose(np.diff(frame.keypoints.xy[..., 0], axis=0), 30, atol=6)  # 0.2 m, 4 m away
     last = stream.flush()
     assert last.keypoints.ids == ("3",) and last.header.stamp.sec == 2
-    assert stream.counts == dict(frames=2, persons=3, lifted=3) and not stream.drops
+    assert stream.counts == dict(frames=2, persons=3, lifted=3) and not stream.ledger.drops
     assert stream.flush() is None
 
 
@@ -267,21 +267,21 @@ def test_one_stamp_for_ever_does_not_gather_for_ever(stream, make):
     stream.max_persons = 3
     for ident in range(10):
         assert send(stream, make, ident) is None
-    assert stream.drops == {"too_many_persons": 7} and "max_persons" in stream.explanations["too_many_persons"]
+    assert stream.ledger.drops == {"too_many_persons": 7} and "max_persons" in stream.ledger.advice["too_many_persons"]
     assert stream.flush().keypoints.persons == 3
 
 
 def test_a_person_that_cannot_be_read_leaves_the_others(stream, make):
     send(stream, make, 1)
-    assert stream.keypoints(foreign.OPENDR, foreign.opendr_of(make, header_of(make, 1), [("door", 1, 1)])) is None
-    assert stream.drops == {"no_common_names": 1}
+    assert stream.keypoints(foreign.OPENDR, foreign.opendr_of(make, header_of(make, 1), [("door", 1, 1)])).frame is None
+    assert stream.ledger.drops == {"no_common_names": 1}
     assert stream.flush().keypoints.ids == ("1",)
 
 
 def test_a_fault_in_lifting_loses_only_the_frame_it_was_in(stream, make, monkeypatch):
     send(stream, make, 1)
     monkeypatch.setattr(stream.lifter, "lift", lambda *_: 1 / 0)
-    assert send(stream, make, 2, seconds=2) is None and stream.drops == {"internal_error": 1}
+    assert send(stream, make, 2, seconds=2) is None and stream.ledger.drops == {"internal_error": 1}
     monkeypatch.undo()
     assert stream.flush().keypoints.ids == ("2",)
 
@@ -290,7 +290,7 @@ def test_the_size_of_an_uncalibrated_camera_is_enough_for_shares(stream, bag_mak
     (pose,) = poses_of(PIXELS[0][:1])
     message = foreign.hri(bag_make, header_of(bag_make), pose)
     stream.keypoints(foreign.HRI, message)
-    assert stream.drops == {"no_image_size": 1}
+    assert stream.ledger.drops == {"no_image_size": 1}
     stream.camera_info(camera_info(bag_make, fx=0.0))
     stream.keypoints(foreign.HRI, message, "/humans/bodies/anna/skeleton2d")
     frame = stream.flush()

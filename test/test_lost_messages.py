@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages that never came are counted, whoever published them."""
+"""Lost messages are counted, whoever published them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_publisher_that_starts_again_has_lost_nothing():
     assert counted([98, 100, 3, 4, 6]) == 2
 
 
-def test_the_graph_is_asked_only_where_a_number_is_odd():
+def test_publishers_are_counted_only_at_a_possible_gap():
     known, asked = PublicationNumbers(), []
 
     def publishers():
@@ -42,7 +42,7 @@ def test_the_graph_is_asked_only_where_a_number_is_odd():
 def test_gaps_of_several_publishers_add_up(publishers, seed):
     rng = random.Random(seed)
     numbers = [rng.randrange(1000) for _ in range(publishers)]
-    came = list(numbers)  # one of each comes first
+    came = list(numbers)  # one message of each publisher comes first
     lost = [0] * publishers
     pending = [0] * publishers
     for _ in range(3000):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""QoS, clocks and what /diagnostics tells of them, over DDS."""
+"""QoS, clocks and their diagnostics, over DDS."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from node_bench import MAKE, Bench, class_of, good, set_parameters
 
 @pytest.fixture
 def started(ros, start_lifter, model_file):
-    """started(*arguments) -> a bench whose node is not matched yet."""
+    """started(*arguments) -> a bench that is not matched with its node yet."""
     benches = []
 
     def start(*arguments: str) -> Bench:
@@ -34,13 +34,13 @@ def test_levels_from_the_first_to_the_last_frame(started):
     bench.until(lambda: bench.got["diagnostics"], "the first diagnostics")
     bench.matched()
     bench.lifts()
-    told = bench.next_diagnostics()
-    assert told.level == DiagnosticStatus.WARN
+    status = bench.next_diagnostics()
+    assert status.level == DiagnosticStatus.WARN
     bench.camera.publish(camera_info(MAKE))
     bench.until(lambda: bench.units() == "m", "metres")
 
     def well():
-        time.sleep(0.02)  # faster would lose some, which is a warning
+        time.sleep(0.02)  # faster would lose some, and that is a warning
         bench.send(good())
         return bench.got["diagnostics"][-1][1].level == DiagnosticStatus.OK
 
@@ -48,7 +48,7 @@ def test_levels_from_the_first_to_the_last_frame(started):
     values = {pair.key: pair.value for pair in bench.got["diagnostics"][-1][1].values}
     assert float(values["rate_in_hz"]) > 0 and float(values["rate_out_hz"]) > 0
     assert (values["certified_share"], values["ambiguous_share"]) == ("1.000", "0.000")
-    assert values["latency_ms_median"] == "unknown"  # the stamps of these tests are of no clock
+    assert values["latency_ms_median"] == "unknown"  # the stamps of these tests follow no clock
     bench.until(lambda: bench.got["diagnostics"][-1][1].level == DiagnosticStatus.STALE, "level STALE")
     assert re.search(r"no keypoints for \d+ s on /", bench.lifter.log())
 
@@ -72,7 +72,7 @@ def test_latency_is_from_stamp_to_publish(started):
 
 
 def test_a_publisher_whose_qos_does_not_match_is_named(ros, started):
-    """The node is told to ask for reliable messages, this publisher is not."""
+    """The node asks for reliable messages, and this publisher is best effort."""
     from rclpy.qos import QoSProfile, ReliabilityPolicy
 
     bench = started("-r", "keypoints:=/loud", "-p", "qos_overrides./loud.subscription.reliability:=reliable")
@@ -88,15 +88,15 @@ def test_a_subscriber_whose_qos_does_not_match_is_named_and_the_override_helps(s
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    for override in ((), ("-p", "qos_overrides./said.publisher.durability:=transient_local")):
+    for override in ((), ("-p", "qos_overrides./renamed.publisher.durability:=transient_local")):
         got = []
-        bench = started("-r", "~/poses:=/said", *override)
-        bench.node.create_subscription(PoseArray, "/said", got.append, latched)
+        bench = started("-r", "~/poses:=/renamed", *override)
+        bench.node.create_subscription(PoseArray, "/renamed", got.append, latched)
         if override:
             bench.until(lambda: bench.send(good()) and got, "poses")
             assert "QoS" not in bench.lifter.log()
         else:
-            bench.until(lambda: "subscriber of /said" in bench.lifter.log(), "the warning")
+            bench.until(lambda: "subscriber of /renamed" in bench.lifter.log(), "the warning")
             assert "DURABILITY" in bench.lifter.log()
         bench.lifter.stop()
 
@@ -105,7 +105,12 @@ def test_a_subscriber_whose_qos_does_not_match_is_named_and_the_override_helps(s
 def test_an_override_that_cannot_be_is_refused(start_lifter, model_file, value):
     policy = "reliability" if value == "sometimes" else "depth"
     lifter = start_lifter(
-        "-p", f"model:={model_file}", "-r", "~/poses:=/said", "-p", f"qos_overrides./said.publisher.{policy}:={value}"
+        "-p",
+        f"model:={model_file}",
+        "-r",
+        "~/poses:=/renamed",
+        "-p",
+        f"qos_overrides./renamed.publisher.{policy}:={value}",
     )
     assert lifter.process.wait(20) == 1
     (line,) = lifter.log().splitlines()
@@ -113,26 +118,26 @@ def test_an_override_that_cannot_be_is_refused(start_lifter, model_file, value):
 
 
 def test_an_input_whose_override_cannot_be_is_an_error_in_diagnostics(started):
-    bench = started("-r", "keypoints:=/odd", "-p", "qos_overrides./odd.subscription.reliability:=sometimes")
-    bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/odd", 1)
+    bench = started("-r", "keypoints:=/wrong", "-p", "qos_overrides./wrong.subscription.reliability:=sometimes")
+    bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/wrong", 1)
     bench.until(lambda: "sometimes" in bench.lifter.log(), "the warning")
     assert bench.next_diagnostics().level == b"\x02" and "Traceback" not in bench.lifter.log()
 
 
 def test_an_input_type_that_is_not_the_published_one_is_an_error(started):
     bench = started("-p", "input_type:=geometry_msgs/msg/PoseArray")
-    said = "has the type sensor_msgs/msg/PointCloud2, but input_type is geometry_msgs/msg/PoseArray"
-    bench.until(lambda: said in bench.lifter.log(), "the warning")
-    bench.until(lambda: said in bench.next_diagnostics().message, "the diagnostics")
+    warning = "has the type sensor_msgs/msg/PointCloud2, but input_type is geometry_msgs/msg/PoseArray"
+    bench.until(lambda: warning in bench.lifter.log(), "the warning")
+    bench.until(lambda: warning in bench.next_diagnostics().message, "the diagnostics")
     assert bench.next_diagnostics().level == b"\x02"
 
 
 def test_simulated_time_that_is_set_back(started):
-    """As a bag that loops: diagnostics go on while it stands, the node lifts on, and says that time was set back."""
+    """As with a bag that loops: diagnostics continue while time stands still, and the node warns and continues."""
     bench = started("-p", "use_sim_time:=true")
     clock = bench.node.create_publisher(class_of("rosgraph_msgs/msg/Clock"), "/clock", 10)
     bench.matched()
-    said = "time was set back by 95.0 s"
+    warning = "time was set back by 95.0 s"
 
     def tick(seconds: int):
         clock.publish(MAKE("rosgraph_msgs/msg/Clock", clock=MAKE("builtin_interfaces/msg/Time", sec=seconds)))
@@ -141,18 +146,18 @@ def test_simulated_time_that_is_set_back(started):
         return [stamp for stamp, _ in bench.got["diagnostics"]]
 
     def at(seconds: int):
-        def told():
+        def reached():
             tick(seconds)
             return stamps() and stamps()[-1] == seconds * 10**9
 
-        return told
+        return reached
 
     bench.until(at(100), "diagnostics of simulated time")
     bench.lifts()
     bench.until(at(5), "diagnostics after the jump")
-    assert bench.lifter.log().count(said) == 1
+    assert bench.lifter.log().count(warning) == 1
     bench.lifts()
-    # Another clock is none that was set.
+    # A change of the clock's source is no jump.
     for simulated in (False, True):
         assert set_parameters(bench, use_sim_time=simulated) == [""]
     tick(5)

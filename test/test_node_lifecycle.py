@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The managed node, driven by its services over DDS, and its model swapped while frames come."""
+"""The managed node: transitions by its services over DDS, and swaps of the model while frames come."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Managed(Bench):
     """A bench that asks for transitions."""
 
     def change(self, label: str) -> bool:
-        """Whether the transition succeeded."""
+        """Request a transition; return True if it succeeded."""
         from lifecycle_msgs.srv import ChangeState
 
         request = ChangeState.Request()
@@ -40,7 +40,7 @@ class Managed(Bench):
         return future.result()
 
     def heard(self, seconds: float) -> int:
-        """How many messages of all topics come within so long, while good frames are sent."""
+        """Send good frames for a while; return how many messages came on all topics."""
         before = {name: len(messages) for name, messages in self.got.items()}
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -73,16 +73,16 @@ def test_transitions(managed):
     bench.matched()
     bench.lifts()
     assert bench.change("deactivate") and bench.state() == "inactive"
-    bench.heard(0.1)  # what was on its way
+    bench.heard(0.1)  # messages on their way
     assert bench.heard(1.3) == 0
     frames = len(bench.got["poses"])
     assert bench.change("activate")
     bench.matched()
     bench.lifts()
-    # What came while it was inactive was not counted, as missed neither.
-    told = bench.diagnosed()
+    # Messages that came while it was inactive are not counted, not even as missed.
+    values = bench.diagnosed()
     bench.until(lambda: int(bench.diagnosed()["frames"]) == len(bench.got["poses"]) > frames, "all frames")
-    assert not [key for key in told if key.startswith("dropped_")]
+    assert not [key for key in values if key.startswith("dropped_")]
     assert bench.change("deactivate") and bench.change("cleanup") and bench.state() == "unconfigured"
     assert bench.change("configure") and bench.change("activate")
     bench.matched()
@@ -117,7 +117,7 @@ def test_a_bad_model_fails_to_configure_and_a_good_one_is_taken_then(managed, mo
 
 @pytest.fixture
 def other_model(model_file, tmp_path):
-    """The same person, but the model says that its metres are twice as many."""
+    """A model of the same person at twice the size in metres."""
     model = load_model(model_file)
     header = {**model.header, "metres_per_unit": 2 * model.metres_per_unit}
     path = tmp_path / "twice.npz"
@@ -126,7 +126,7 @@ def other_model(model_file, tmp_path):
 
 
 def test_a_model_is_swapped_between_two_frames_and_none_is_lost(managed, other_model, model_file):
-    """Up to 100 Hz: every stamp is answered once; persons are 4 m away before the swap, 8 m after."""
+    """Every stamp is answered once at up to 100 Hz. Persons are 4 m away before the swap and 8 m after."""
     from conftest import camera_info
 
     bench = managed()
@@ -139,7 +139,7 @@ def test_a_model_is_swapped_between_two_frames_and_none_is_lost(managed, other_m
     due, sent = time.monotonic(), 0
     while sent < 300:
         answered = bench.got["poses"][-1].header.stamp.sec
-        # A machine that stands still for long may not lose them by more than the queues hold.
+        # If the machine stalls, wait: the queues hold 10 messages.
         if time.monotonic() >= due and bench.stamp - answered < 8:
             bench.send(good())
             due, sent = time.monotonic() + 0.01, sent + 1
@@ -155,16 +155,16 @@ def test_a_model_is_swapped_between_two_frames_and_none_is_lost(managed, other_m
     assert stamps == list(range(first, bench.stamp + 1))
     depth = {msg.header.stamp.sec: msg.poses[0].position.z for msg in bench.got["poses"] if msg.poses}
     near = [stamp for stamp in stamps if depth[stamp] < 6]
-    # What came before the request may wait while that is answered, but nothing of it is answered twice or out of turn.
+    # Messages that came before the request may wait for its answer, but none is answered twice or out of order.
     assert near and near == stamps[: len(near)] and near[-1] <= swapped
     assert depth[first] == pytest.approx(4, abs=0.2) and depth[bench.stamp] == pytest.approx(8, abs=0.4)
     assert bench.layout()["model"] == "twice" and bench.units() == "m"
-    told = bench.diagnosed()
-    assert told["model"] == "twice" and int(told["frames"]) >= 300 and told.get("dropped_missed") == missed
+    values = bench.diagnosed()
+    assert values["model"] == "twice" and int(values["frames"]) >= 300 and values.get("dropped_missed") == missed
 
 
 def ask(bench, **values):
-    """Asks for parameters and does not wait."""
+    """Request parameters without waiting for the answer."""
     from rcl_interfaces.srv import SetParameters
     from rclpy.parameter import Parameter
 
@@ -215,18 +215,17 @@ def test_the_same_path_is_read_anew(managed, model_file, other_model, tmp_path):
 
 def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeypatch, other_model, model_file):
     from foreign_messages import OPENDR, LiveMake, opendr
-    from test_node import POSES
-
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        monkeypatch.setenv(variable, "1")
     from rclpy.parameter import Parameter
+    from test_pipeline import POSES
 
     from paul_ros.ros.node import LifterNode
 
     node, models = LifterNode(), []
     node.start()
-    monkeypatch.setattr(node, "_publish", lambda frame: models.append(node.stream.lifter.model.name))
-    node._on_keypoints(OPENDR, opendr(LiveMake(), header_of(MAKE), pose=POSES[0]), "/keypoints", 0)
+    monkeypatch.setattr(
+        node.pipeline._topics, "publish_frame", lambda frame: models.append(node.stream.lifter.model.name)
+    )
+    node.pipeline.on_keypoints(OPENDR, opendr(LiveMake(), header_of(MAKE), pose=POSES[0]), "/keypoints", 0)
     before = node.stream.lifter.model.name
     assert not models
     assert node.set_parameters([Parameter("model", value=str(other_model))])[0].successful
@@ -235,13 +234,14 @@ def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeyp
     node.destroy_node()
 
 
-def test_a_fault_in_a_transition_is_told_and_leads_back(ros, monkeypatch, capfd):
+def test_a_fault_in_a_transition_is_logged_and_leads_to_unconfigured(ros, monkeypatch, capfd):
     from paul_ros.ros.node import LifterNode
+    from paul_ros.ros.rclpy_internals import lifecycle_state
 
     node = LifterNode()
-    monkeypatch.setattr(node, "_configure", lambda: 1 / 0)
+    monkeypatch.setattr("paul_ros.ros.node.Pipeline", lambda *_: 1 / 0)
     node.trigger_configure()
-    assert node._state_machine.current_state[1] == "unconfigured"
+    assert lifecycle_state(node) == "unconfigured"
     assert "ZeroDivisionError" in capfd.readouterr().err
     monkeypatch.undo()
     node.start()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launch files, the layouts of RViz and Foxglove and the security policy: all name what the node really has."""
+"""Launch files, layouts of RViz and Foxglove, and the security policy: all names in them are the node's."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from conftest import ROOT
 from node_bench import MAKE, class_of
 
 from msg_adapters import outputs
-from paul_ros.stream.stream import OPTIONAL, OUTPUTS
+from paul_ros.stream.messages import OUTPUTS
 
 PACKAGE = "paul_ros"
 POLICY = ElementTree.parse(ROOT / "sros2/lifter.policy.xml").getroot()
-#: Element -> (what it may hold, attributes that it must have, attributes of which it must have one), by
-#: sros2's policy.xsd of version 0.2.0.
+#: Element -> (allowed children, required attributes, attributes of which one is required), by sros2's policy.xsd
+#: of version 0.2.0.
 SCHEMA = {
     "policy": ({"enclaves"}, {"version"}, set()),
     "enclaves": ({"enclave"}, set(), set()),
@@ -32,9 +32,9 @@ SCHEMA = {
 
 
 def every_topic() -> set[str]:
-    """All that a node without remappings may publish."""
-    names = {name for name in (*OUTPUTS, *OPTIONAL, "layout") if name != "transforms"}
-    return {f"/lifter/{name}" for name in names} | {"/diagnostics", "/tf"}
+    """Topics that a node without remappings may publish."""
+    topics = {output.topic.replace("~", "/lifter") for output in OUTPUTS.values()}
+    return topics | {"/lifter/layout", "/diagnostics"}
 
 
 def test_the_policy_keeps_to_the_schema():
@@ -52,7 +52,7 @@ def test_the_policy_keeps_to_the_schema():
 
 
 def allowed(group: str, way: str, namespace: str) -> set[str]:
-    """Full names that the policy allows, were it for a node in this namespace."""
+    """Full names that the policy would allow a node in this namespace."""
     (profile,) = POLICY.iter("profile")
     found = [element.text for part in profile.findall(group) if part.get(way) == "ALLOW" for element in part]
     assert len(set(found)) == len(found)
@@ -63,7 +63,7 @@ def allowed(group: str, way: str, namespace: str) -> set[str]:
 
 @pytest.fixture
 def graph(ros, start_lifter, model_file):
-    """Of a node in simulated time: its publishers, subscriptions, services and namespace."""
+    """Publishers, subscriptions, services and namespace of a node in simulated time."""
     from rclpy.qos import QoSProfile
 
     lifter = start_lifter("-p", f"model:={model_file}", "-p", "use_sim_time:=true")
@@ -100,7 +100,7 @@ def graph(ros, start_lifter, model_file):
 
 def test_the_policy_allows_what_the_node_does_and_no_more(graph):
     publishers, subscriptions, services, namespace = graph
-    # These two need packages that are not here.
+    # These two need packages that are not installed.
     assert publishers == allowed("topics", "publish", namespace) - {"/tf", f"{namespace}/lifter/annotations"}
     assert subscriptions == allowed("topics", "subscribe", namespace)
     assert services == allowed("services", "reply", namespace)
@@ -120,7 +120,8 @@ def test_the_view_of_rviz_shows_the_outputs():
         if "Topic" in display:
             assert display["Topic"]["Durability Policy"] == "Volatile"
             shown[display["Topic"]["Value"].removeprefix("/lifter/")] = kinds[display["Class"].rpartition("/")[2]]
-    assert shown.items() <= OUTPUTS.items() and len(shown) == 3
+    published = {name: output.message_type for name, output in OUTPUTS.items()}
+    assert shown.items() <= published.items() and len(shown) == 3
     cloud = next(display for display in manager["Displays"] if "Channel Name" in display)
     assert cloud["Channel Name"] in {field.name for field in points_cloud().fields}
 
@@ -151,7 +152,7 @@ def test_the_layout_of_foxglove_shows_the_outputs():
 
 
 def test_the_demo_launches_what_there_is():
-    """launch is on no index: the file is read as XML."""
+    """No index has launch, so the file is read as XML."""
     launch = ElementTree.parse(ROOT / "launch/demo.launch.xml").getroot()
     text = ElementTree.tostring(launch, encoding="unicode")
     arguments = {argument.get("name"): argument.get("default") for argument in launch.findall("arg")}

@@ -221,9 +221,9 @@ def test_the_launch_file_names_what_there_is() -> None:
     assert used == set(arguments)
     parameters = ROOT / arguments["config"].removeprefix(f"$(find-pkg-share {PACKAGE})/")
     assert yaml.safe_load(parameters.read_text())["/**"]["ros__parameters"]
-    node_source = (ROOT / "paul_ros/ros/node.py").read_text(encoding="utf-8")
+    pipeline_source = (ROOT / "paul_ros/ros/pipeline.py").read_text(encoding="utf-8")
     for remap in node.findall("remap"):
-        assert f'"{remap.get("from")}"' in node_source
+        assert f'"{remap.get("from")}"' in pipeline_source
 
 
 def test_launchers_are_executable_in_git() -> None:

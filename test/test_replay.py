@@ -506,7 +506,7 @@ def test_bytes_that_are_no_message_are_a_counted_drop(model_file, tmp_path):
         part_of(ONE, tmp_path / f"{name}.mcap", 3, how) for name, how in (("cut", cut), ("all", lambda r: r))
     )
     done, all_of_it = replay(broken, open_stream(model_file)), replay(whole, open_stream(model_file))
-    drops = done.stream.drops["undecodable"]
-    assert drops > 5 and done.damage is None and "does not decode" in done.stream.explanations["undecodable"]
+    drops = done.stream.ledger.drops["undecodable"]
+    assert drops > 5 and done.damage is None and "does not decode" in done.stream.ledger.advice["undecodable"]
     lost = len(all_of_it.frames) - len(done.frames)
     assert 3 < lost <= drops and done.frames[-1].stamp == all_of_it.frames[-1].stamp

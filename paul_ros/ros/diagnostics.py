@@ -1,156 +1,156 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the node fares: rates, latency, shares and the level of /diagnostics (REP-107), by rules stated here.
+"""The node's health: rates, latency, shares and the level of /diagnostics (REP-107). Knows nothing of ROS.
 
-ERROR: the input cannot be read, a fault of the node itself since the last report, or every message since then was of no
-use. STALE: keypoints came once, but none for STALE_SECONDS. WARN: no keypoints yet or since the last report, something
-was dropped, a QoS does not match, keypoints name another frame than the camera's, most persons are like no shape of the
-model, or points are in model units though the model knows its metres. OK: none of these.
+The levels, from the first that applies:
+
+- ERROR: the input cannot be read; or, since the last report, the node itself failed or could use no message.
+- STALE: keypoints came once, but none for STALE_SECONDS.
+- WARN: any of these was found since the last report. No keypoints came. Something was dropped. A QoS does not match.
+  The keypoints' frame is not the camera's. Most persons hardly fit the model. A CameraInfo is missing for metres.
+- OK: none of these.
 """
 
 from __future__ import annotations
 
-import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from paul_ros.lifted import AMBIGUOUS
-from paul_ros.stream.stream import Frame, LiftStream
+from paul_ros.lifter import AMBIGUOUS
+from paul_ros.stream.frame import Frame
+from paul_ros.stream.stream import LiftStream
 
 #: Levels, by the numbers of diagnostic_msgs/DiagnosticStatus.
 OK, WARN, ERROR, STALE = range(4)
 
 STALE_SECONDS = 5.0
-"""Of silence; diagnostic_aggregator calls a node that says nothing stale after as long."""
+"""Silence from which the level is STALE; diagnostic_aggregator allows a silent node as long."""
 
-MOST_LATENCY_SECONDS = 10.0
-"""A stamp that is older, or from the future, is of another clock, as in a bag that is played, and tells no latency."""
+MAX_LATENCY_SECONDS = 10.0
+"""Latency above which a stamp is ignored. Such a stamp, or one in the future, belongs to another clock, as in a bag."""
+
+MOST_PERSONS = 0.5
+"""Share of the lifted persons that must hardly fit the model before it is worth a warning."""
 
 _LATENCIES_KEPT = 1000  # frames, the last half minute at 30 Hz
 _NS = 1e9
 
 
-class Aloud:
-    """Says a text at once, and what has the same key again only after a while; `say` writes the log."""
-
-    def __init__(self, say: Callable[[str], None], every: float = 5.0) -> None:
-        self._say, self._every, self._said = say, every, {}
-
-    def __call__(self, key: str, text: str, every: float | None = None) -> None:
-        """every: seconds, of this key."""
-        now = time.monotonic()
-        if now - self._said.get(key, -np.inf) >= (every or self._every):
-            self._said[key] = now
-            self._say(text)
-
-    def hold(self, *keys: str) -> None:
-        """Says nothing of these for as long as if it had just been said."""
-        self._said.update(dict.fromkeys(keys, time.monotonic()))
-
-
 @dataclass(frozen=True)
 class Report:
-    """level: one of OK, WARN, ERROR, STALE; message: one line; values: name -> what /diagnostics tells of it.
+    """The state of the node since the last report.
 
-    frames: since the last report. waited: seconds without keypoints, before the first since it began to wait for them.
+    Attributes:
+        level: OK, WARN, ERROR or STALE.
+        message: one line for people.
+        values: name -> value, for /diagnostics.
+        frames: number of frames since the last report.
+        silent_seconds: seconds since the last keypoints; before the first, since the node began to wait.
     """
 
     level: int
     message: str
-    values: dict
+    values: dict[str, Any]
     frames: int
-    waited: float
+    silent_seconds: float
 
 
 class Health:
-    """Counts what comes and goes, and reports on the time since the last report. Times are in seconds, monotonic."""
+    """Counts messages and frames, and reports on the time since the last report. Times are monotonic seconds."""
 
-    def __init__(self, now: float, drops: Counter = Counter(), notes: Counter = Counter()) -> None:
-        """drops, notes: that are old news."""
-        self._began = self._since = now
+    def __init__(self, now: float, drops: Mapping[str, int] = {}, notes: Mapping[str, int] = {}) -> None:
+        """Begin to wait for keypoints; drops and notes were counted before and are not reported."""
+        self._began = self._last_report = now
         self._last_input: float | None = None
-        self._came = self._went = 0
+        self._messages = self._frames = self._mismatches = 0
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
-        self._doubts: list = []
-        self._counted, self._noted = Counter(drops), Counter(notes)
-        self._mismatches = 0
+        self._lifted: list[tuple[np.ndarray, np.ndarray]] = []
+        self._old_drops, self._old_notes = Counter(drops), Counter(notes)
 
-    def came(self, now: float) -> None:
-        """A message of keypoints."""
-        self._came += 1
+    def received(self, now: float) -> None:
+        """Count a message of keypoints."""
+        self._messages += 1
         self._last_input = now
 
-    def went(self, frame: Frame, clock: int) -> None:
-        """A frame was published; clock: ns now, by the clock that stamps are of."""
-        self._went += 1
-        # Looked at once a second: a frame must not wait for that.
-        self._doubts.append((frame.lifted.certified, frame.lifted.ambiguity))
+    def published(self, frame: Frame, clock: int) -> None:
+        """Count a frame; `clock` is the present in nanoseconds, by the clock of the stamps."""
+        self._frames += 1
+        # Evaluated once a second, since a frame must not wait for that.
+        self._lifted.append((frame.lifted.certified, frame.lifted.ambiguity))
         latency = (clock - frame.keypoints.stamp) / _NS
-        if 0 <= latency <= MOST_LATENCY_SECONDS:
+        if 0 <= latency <= MAX_LATENCY_SECONDS:
             self._latencies.append(latency)
 
-    def mismatch(self) -> None:
-        """An endpoint was found whose QoS does not match."""
+    def qos_mismatch(self) -> None:
+        """Count an endpoint whose QoS does not match."""
         self._mismatches += 1
 
     def forget_latency(self) -> None:
-        """The clock was set."""
+        """Discard all latencies, after the clock was set."""
         self._latencies.clear()
 
-    def report(self, now: float, stream: LiftStream, problem: str = "", source: str = "none") -> Report:
-        """problem: why the input cannot be read, '' where it can, or is not there yet; source: its type."""
+    def report(self, now: float, stream: LiftStream, problem: str = "", input_type: str = "none") -> Report:
+        """Report on the time since the last report.
+
+        Args:
+            now: monotonic seconds.
+            stream: the stream in use.
+            problem: why the input cannot be read; '' if it can, or if there is none yet.
+            input_type: message type of the input.
+        """
         silence = None if self._last_input is None else now - self._last_input
-        drops = stream.drops - self._counted
+        drops = Counter(stream.ledger.drops) - self._old_drops
         level, message = self._level(drops, silence, problem, stream)
-        frames, values = self._went, self._values(now, silence, stream, source)
-        self._since, self._came, self._went, self._mismatches = now, 0, 0, 0
-        self._counted, self._noted, self._doubts = Counter(stream.drops), Counter(stream.notes), []
+        frames, values = self._frames, self._values(now, silence, stream, input_type)
+        self._last_report, self._messages, self._frames, self._mismatches = now, 0, 0, 0
+        self._old_drops, self._old_notes = Counter(stream.ledger.drops), Counter(stream.ledger.notes)
+        self._lifted = []
         return Report(level, message, values, frames, now - self._began if silence is None else silence)
 
     def _level(self, drops: Counter, silence: float | None, problem: str, stream: LiftStream) -> tuple[int, str]:
         if problem:
             return ERROR, problem
         if drops["internal_error"]:
-            return ERROR, f"a fault of this node; dropped: {listed(drops)}"
-        if self._came and not self._went and _messages(drops) >= self._came:
-            return ERROR, f"nothing that came could be used; dropped: {listed(drops)}"
+            return ERROR, f"a fault of this node, see its log; dropped: {listed(drops)}"
+        if self._messages and not self._frames and _dropped_messages(drops) >= self._messages:
+            return ERROR, f"no message could be used; dropped: {listed(drops)}"
         if silence is not None and silence >= STALE_SECONDS:
-            return STALE, f"no keypoints for {silence:.0f} s"
-        odd = list(self._odd(drops, silence, stream))
-        said = f"{self._went} frames since the last report, units: {stream.units}"
-        return (WARN, "; ".join([*odd, said])) if odd else (OK, said)
+            return STALE, f"no keypoints for {silence:.0f} s; check the detector"
+        warnings = list(self._warnings(drops, silence, stream))
+        summary = f"{self._frames} frames since the last report, units: {stream.units}"
+        return (WARN, "; ".join([*warnings, summary])) if warnings else (OK, summary)
 
-    def _odd(self, drops: Counter, silence: float | None, stream: LiftStream):
-        """What is worth a warning."""
+    def _warnings(self, drops: Counter, silence: float | None, stream: LiftStream) -> Iterator[str]:
         if silence is None:
             yield "no keypoints yet"
-        elif not self._came:
+        elif not self._messages:
             yield "no keypoints since the last report"
         if drops:
             yield f"dropped: {listed(drops)}"
         if self._mismatches:
-            yield f"{self._mismatches} endpoints with a QoS that does not match"
-        notes = stream.notes - self._noted
+            yield f"{self._mismatches} endpoints with a QoS that does not match, see the log"
+        notes = Counter(stream.ledger.notes) - self._old_notes
         if notes["another_frame"]:
-            yield stream.explanations["another_frame"]
-        if notes["unlike_the_model"] > 0.5 * self._lifted():
-            yield stream.explanations["unlike_the_model"]
-        if unscaled(stream) and self._went:
-            yield "no metres, for no usable CameraInfo has come"
+            yield stream.ledger.advice["another_frame"]
+        if notes["unlike_the_model"] > MOST_PERSONS * self._persons_lifted():
+            yield stream.ledger.advice["unlike_the_model"]
+        if lacks_camera_info(stream) and self._frames:
+            yield "no metres without a usable CameraInfo, remap `camera_info`"
 
-    def _values(self, now: float, silence: float | None, stream: LiftStream, source: str) -> dict:
-        elapsed = max(now - self._since, 1e-9)
+    def _values(self, now: float, silence: float | None, stream: LiftStream, input_type: str) -> dict[str, Any]:
+        elapsed = max(now - self._last_report, 1e-9)
         lift = percentiles(stream.lift_us)
         latency = percentiles(self._latencies)
-        told = stream.describe()
+        described = stream.describe()
         return {
             **stream.counts,
-            **{f"dropped_{reason}": count for reason, count in sorted(stream.drops.items())},
-            **{f"noted_{what}": count for what, count in sorted(stream.notes.items())},
-            "rate_in_hz": f"{self._came / elapsed:.1f}",
-            "rate_out_hz": f"{self._went / elapsed:.1f}",
+            **{f"dropped_{reason}": count for reason, count in sorted(stream.ledger.drops.items())},
+            **{f"noted_{reason}": count for reason, count in sorted(stream.ledger.notes.items())},
+            "rate_in_hz": f"{self._messages / elapsed:.1f}",
+            "rate_out_hz": f"{self._frames / elapsed:.1f}",
             "last_input_age_s": "none" if silence is None else f"{silence:.1f}",
             "latency_ms_median": f"{1e3 * latency[0]:.2f}" if latency else "unknown",
             "latency_ms_p99": f"{1e3 * latency[1]:.2f}" if latency else "unknown",
@@ -158,41 +158,55 @@ class Health:
             "lift_us_p99": f"{lift[1]:.1f}" if lift else "0.0",
             **self._shares(),
             "units": stream.units,
-            "input_type": source,
-            **{key: told[key] for key in ("input_layout", "layout", "model", "model_sha256")},
+            "input_type": input_type,
+            **{key: described[key] for key in ("input_layout", "layout", "model", "model_sha256")},
         }
 
-    def _lifted(self) -> int:
-        """Persons since the last report."""
-        return sum(int(np.isfinite(ambiguity).sum()) for _, ambiguity in self._doubts)
+    def _persons_lifted(self) -> int:
+        """Return the number of persons lifted since the last report; others have no ambiguity."""
+        return sum(int(np.isfinite(ambiguity).sum()) for _, ambiguity in self._lifted)
 
-    def _shares(self) -> dict:
-        """Of the persons that were lifted since the last report; a person that was not has no ambiguity."""
-        certified, ambiguity = map(np.concatenate, zip(*self._doubts)) if self._doubts else np.empty((2, 0))
-        lifted = np.isfinite(ambiguity)
-        if not lifted.any():
+    def _shares(self) -> dict[str, str]:
+        """Return the certified and the ambiguous share of the persons lifted since the last report."""
+        if not self._persons_lifted():
             return {"certified_share": "none", "ambiguous_share": "none"}
+        certified, ambiguity = map(np.concatenate, zip(*self._lifted))
+        lifted = np.isfinite(ambiguity)
         return {
             "certified_share": f"{np.mean(certified[lifted]):.3f}",
             "ambiguous_share": f"{np.mean(ambiguity[lifted] >= AMBIGUOUS):.3f}",
         }
 
 
-def unscaled(stream: LiftStream) -> bool:
-    """Whether points are in model units although the model knows its metres: a CameraInfo is what lacks."""
+def lacks_camera_info(stream: LiftStream) -> bool:
+    """Return whether points are in model units only because no usable CameraInfo has come."""
     return stream.units == "model" and stream.lifter.metres_per_unit is not None
 
 
-def percentiles(values) -> tuple[float, float] | None:
-    """Median and 99th percentile; None of nothing."""
-    return tuple(np.percentile(values, (50, 99)).tolist()) if values else None
+def percentiles(values: Iterable[float]) -> tuple[float, float] | None:
+    """Return the median and the 99th percentile; None if there are no values."""
+    numbers = list(values)
+    if not numbers:
+        return None
+    median, p99 = np.percentile(numbers, (50, 99)).tolist()
+    return median, p99
 
 
-def listed(counter: Counter) -> str:
-    """As '2 wrong_fields, 1 not_2d'."""
-    return ", ".join(f"{count} {reason}" for reason, count in sorted(counter.items())) or "none"
+def listed(counts: Mapping[str, int]) -> str:
+    """Return counts as text, such as '1 not_2d, 2 wrong_fields'."""
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())) or "none"
 
 
-def _messages(drops: Counter) -> int:
-    """How many of the drops are messages that came: not persons of one, nor what never came."""
+def summary(stream: LiftStream) -> str:
+    """Return in one line what a stream has done."""
+    median, p99 = percentiles(stream.lift_us) or (0.0, 0.0)
+    counts = stream.counts
+    return (
+        f"{counts['frames']} frames, {counts['lifted']} of {counts['persons']} persons lifted, "
+        f"median {median:.0f} µs, p99 {p99:.0f} µs a frame; dropped: {listed(stream.ledger.drops)}"
+    )
+
+
+def _dropped_messages(drops: Counter) -> int:
+    """Return how many drops are messages that came: neither persons nor messages that were lost on the way."""
     return sum(count for reason, count in drops.items() if not reason.startswith("person_") and reason != "missed")

@@ -1,84 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's input of keypoints: subscribed as soon as its type is known, and what is wrong with it said aloud."""
+"""The node's input of keypoints: finds the type of its topic, subscribes, and warns of what prevents it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, Protocol
 
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 import msg_adapters
-from paul_ros.ros.diagnostics import Aloud
-from paul_ros.ros.endpoints import NOT_POSSIBLE, OVERRIDES, input_qos, message_class, unheard
+from paul_ros.errors import ParameterError
+from paul_ros.ros.advisor import ThrottledLog
 from paul_ros.ros.lost_messages import PublicationNumbers
-from paul_ros.ros.ros4hri import BODY, LIST, Tracked
+from paul_ros.ros.messages import message_class
+from paul_ros.ros.node_parameters import RCLPY_REFUSALS
+from paul_ros.ros.qos import OVERRIDES, input_qos, subscription_events
+from paul_ros.ros.ros4hri import BODY, LIST, BodyTopics
 
-_RAW = "sensor_msgs/msg/PointCloud2"
-"""The type whose serialised bytes the stream reads; rclpy's objects would cost more than lifting."""
+AUTO = "auto"
+"""Value of `input_type` that takes the type of the topic's publishers."""
+
+_SERIALISED = "sensor_msgs/msg/PointCloud2"
+"""Type whose serialised bytes the stream reads: rclpy's objects would cost more than lifting."""
 
 
 def readable() -> list[str]:
-    """Names of the types that `keypoints` may have."""
+    """Return the types that the topic may have."""
     return [*msg_adapters.SUPPORTED, LIST]
 
 
-class KeypointInput:
-    """The subscription of `keypoints`, or, where its topic lists the bodies of ROS4HRI, one for each of these.
+class KeypointListener(Protocol):
+    """The receiver of what the input gets."""
 
-    type_name: of the topic, None until it is known and subscribed. problem: why it cannot be read, '' where it can.
+    def on_keypoints(self, type_name: str, msg: Any, topic: str, missed: int) -> None:
+        """Take a message.
+
+        Args:
+            type_name: such as 'sensor_msgs/msg/PointCloud2'.
+            msg: the message; a PointCloud2 as serialised bytes.
+            topic: that it came from.
+            missed: number of messages before it that were lost, or were replaced while the node was busy.
+        """
+
+    def on_no_bodies(self) -> None:
+        """Take the news that the list of bodies is empty, so no message of a body can come."""
+
+    def on_qos_mismatch(self, topic: str, warning: str) -> None:
+        """Take a warning about a publisher whose QoS does not match."""
+
+    def max_bodies(self) -> int:
+        """Return the largest number of bodies to follow."""
+
+
+class KeypointInput:
+    """The subscription of keypoints; one for each body if the topic lists the bodies of ROS4HRI.
+
+    Attributes:
+        topic: full name of the topic.
+        type_name: type of the topic; None until it is subscribed.
+        problem: why the topic cannot be read; '' if it can, or if nobody publishes it yet.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        topic: str,
-        wanted: str,
-        take: Callable[[str, object, str, int], None],
-        most: Callable[[], int],
-        warn: Aloud,
-        nobody: Callable[[], None],
-        mismatch: Callable[[str, str], None],
-    ) -> None:
-        """wanted: a type's name, or auto; most(): bodies to follow; mismatch(topic, text): QoS that do not match.
+    def __init__(self, node: Node, topic: str, wanted: str, listener: KeypointListener, warn: ThrottledLog) -> None:
+        """Make an input that is not subscribed yet.
 
-        nobody() is told each list that has no body: then no message of one can come.
+        Args:
+            node: owner of the subscriptions.
+            topic: name of the topic.
+            wanted: type of the topic, or AUTO.
+            listener: receiver of the messages.
+            warn: log of what prevents a subscription.
 
-        take(type_name, msg, topic, missed) gets each message, a PointCloud2 as serialised bytes, and how many before it
-        were published but never came, or were replaced by newer ones while the node was busy. Raises ValueError where
-        the wanted type cannot be read.
+        Raises:
+            ParameterError: the wanted type cannot be read.
         """
-        if wanted != "auto" and wanted not in readable():
-            raise ValueError(f"input_type is {wanted}; it must be auto or one of {', '.join(readable())}")
+        if wanted != AUTO and wanted not in readable():
+            raise ParameterError(f"input_type is {wanted}; it must be {AUTO} or one of {', '.join(readable())}")
+        self.topic = node.resolve_topic_name(topic)
         self.type_name: str | None = None
         self.problem = ""
-        self._node, self._wanted, self._take, self._most = node, wanted, take, most
-        self._warn, self._nobody, self._mismatch = warn, nobody, mismatch
-        self.topic = node.resolve_topic_name(topic)
+        self._node, self._wanted, self._listener, self._warn = node, wanted, listener, warn
         self._subscription: Subscription | None = None
-        self._bodies: Tracked | None = None
+        self._bodies = BodyTopics(self.topic, self._subscribe_body, node.destroy_subscription)
 
-    def look(self) -> bool:
-        """Subscribes if that is possible now; says what is missing where it is not. Whether it is subscribed."""
-        types = [self._wanted] if self._wanted != "auto" else self._published_types()
+    def try_subscribe(self) -> bool:
+        """Subscribe if that is possible now, else warn of what is missing; return whether it is subscribed."""
+        types = [self._wanted] if self._wanted != AUTO else self._published_types()
         known = [name for name in types if name in readable()]
         if not types:
             self.problem = ""
-            self._warn("no input", f"nobody publishes {self.topic} yet; remap `keypoints` to your detector")
+            self._warn("no input", f"nobody publishes {self.topic} yet. Remap `keypoints` to your detector.")
         elif not known:
-            self._cannot(
+            self._report(
                 "unknown type",
                 f"{self.topic} has the type {', '.join(types)}, which cannot be read; "
-                f"readable are {', '.join(readable())}",
+                f"publish one of {', '.join(readable())}",
             )
         else:
-            self._open(known[0])
+            self._subscribe(known[0])
         return self.type_name is not None
 
-    def check(self) -> bool:
-        """Whether look() has done its work: not where the type is found from the graph and has become another.
+    def check_type(self) -> bool:
+        """Compare the subscribed type with the published ones.
 
-        Where the wanted type is not the one that is published, that is said aloud.
+        Returns:
+            False if the type was found from publishers that are gone: the subscription is closed, and
+            `try_subscribe` may find another. A type that was asked for stays, with a warning.
         """
         if self.type_name is None:
             return True
@@ -86,75 +114,85 @@ class KeypointInput:
         if not types or self.type_name in types:
             self.problem = ""
             return True
-        if self._wanted == "auto":
+        if self._wanted == AUTO:
             self.close()
             return False
-        self._cannot(
+        self._report(
             "other type",
             f"{self.topic} has the type {', '.join(types)}, but input_type is {self._wanted}: nothing comes from it; "
-            "correct input_type, or leave it at auto",
+            f"correct input_type, or leave it at {AUTO}",
         )
         return True
 
-    def alone(self) -> str:
-        """': nobody publishes it ...' where that is so, else ''."""
-        return "" if self._published_types() else ": nobody publishes it; remap `keypoints` to your detector"
+    def has_publisher(self) -> bool:
+        """Return whether anybody publishes the topic."""
+        return bool(self._published_types())
 
     def close(self) -> None:
-        """Ends all subscriptions; look() may open them again."""
-        if self._bodies:
-            self._bodies.clear()
+        """End all subscriptions; `try_subscribe` may open them again."""
+        self._bodies.clear()
         if self._subscription:
             self._node.destroy_subscription(self._subscription)
-        self._bodies = self._subscription = self.type_name = None
-
-    def _follow(self, msg) -> None:
-        """Reads the bodies that a list names."""
-        if not msg.ids:
-            self._nobody()
-        if left := self._bodies.update(msg.ids, self._most()):
-            self._warn("bodies", f"bodies that are not read, by their ids: {', '.join(map(repr, left[:5]))}")
+        self._subscription = self.type_name = None
 
     def _published_types(self) -> list[str]:
         return sorted({info.topic_type for info in self._node.get_publishers_info_by_topic(self.topic)})
 
-    def _cannot(self, key: str, text: str) -> None:
-        self.problem = text
-        self._warn(key, text)
+    def _report(self, key: str, problem: str) -> None:
+        self.problem = problem
+        self._warn(key, problem)
 
-    def _open(self, type_name: str) -> None:
+    def _subscribe(self, type_name: str) -> None:
         try:
-            kinds = [message_class(name) for name in ([LIST, BODY] if type_name == LIST else [type_name])]
-            self._subscription = self._subscribe(kinds[0], type_name)
+            if type_name == LIST:
+                message_class(BODY)  # bodies are subscribed later, when no warning is made of a missing package
+            self._subscription = self._create_subscription(message_class(type_name), type_name)
         except ImportError as error:
-            self._cannot(
+            self._report(
                 "no package",
-                f"{self.topic} has the type {type_name}, whose package cannot be "
-                f"imported ({error}); install it or source its workspace",
+                f"{self.topic} has the type {type_name}, whose package cannot be imported ({error}); install it or "
+                "source its workspace",
             )
             return
-        except NOT_POSSIBLE as error:
-            self._cannot("impossible", f"{self.topic} cannot be subscribed: {error}")
+        except RCLPY_REFUSALS as error:
+            self._report("impossible", f"{self.topic} cannot be subscribed: {error}")
             return
         self.type_name, self.problem = type_name, ""
         self._node.get_logger().info(f"reading {type_name} from {self.topic}")
 
-    def _subscribe(self, kind: type, type_name: str) -> Subscription:
-        options = dict(event_callbacks=unheard(self.topic, self._mismatch), qos_overriding_options=OVERRIDES)
-        if type_name == LIST:
-            self._bodies = Tracked(self.topic, self._open_body, self._node.destroy_subscription)
-            return self._node.create_subscription(kind, self.topic, self._follow, input_qos(), **options)
-        on_message, raw = self._reader(type_name, self.topic), type_name == _RAW
-        return self._node.create_subscription(kind, self.topic, on_message, input_qos(), raw=raw, **options)
+    def _create_subscription(self, kind: Any, type_name: str) -> Subscription:
+        callback: Callable[..., None] = self._on_list if type_name == LIST else self._reader(type_name, self.topic)
+        return self._node.create_subscription(
+            kind,
+            self.topic,
+            callback,
+            input_qos(),
+            raw=type_name == _SERIALISED,
+            event_callbacks=subscription_events(self.topic, self._listener.on_qos_mismatch),
+            qos_overriding_options=OVERRIDES,
+        )
 
-    def _open_body(self, topic: str) -> Subscription:
+    def _on_list(self, msg: Any) -> None:
+        if not msg.ids:
+            self._listener.on_no_bodies()
+        if ignored := self._bodies.update(msg.ids, self._listener.max_bodies()):
+            names = ", ".join(map(repr, ignored[:5]))
+            self._warn(
+                "bodies",
+                f"bodies that are not read, by their ids: {names}. Raise `max_persons`, or publish ids that a topic's "
+                "name may hold.",
+            )
+
+    def _subscribe_body(self, topic: str) -> Subscription:
         return self._node.create_subscription(message_class(BODY), topic, self._reader(BODY, topic), input_qos())
 
-    def _reader(self, type_name: str, topic: str) -> Callable:
+    def _reader(self, type_name: str, topic: str) -> Callable[..., None]:
+        """Return the callback of a subscription, which counts the messages that were lost."""
         numbers = PublicationNumbers()
 
-        def on_message(msg, info: dict) -> None:
+        def on_message(msg: Any, info: Any) -> None:
             number = info["publication_sequence_number"]
-            self._take(type_name, msg, topic, numbers.missed(number, lambda: self._node.count_publishers(topic)))
+            missed = numbers.missed(number, lambda: self._node.count_publishers(topic))
+            self._listener.on_keypoints(type_name, msg, topic, missed)
 
         return on_message

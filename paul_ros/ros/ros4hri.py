@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics to read while ROS4HRI's bodies come and go (REP-155); knows nothing of ROS.
+"""The topics of ROS4HRI's tracked bodies (REP-155), as they appear and leave. Knows nothing of ROS.
 
-/humans/bodies/tracked lists the ids of the bodies in view, and each has its keypoints on a topic of its own,
+/humans/bodies/tracked lists the ids of the bodies in view. Each body has its keypoints on a topic of its own,
 /humans/bodies/ID/skeleton2d.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 LIST = "hri_msgs/msg/IdsList"
 """Type of the list; field ids, string[]."""
@@ -16,32 +17,39 @@ LIST = "hri_msgs/msg/IdsList"
 BODY = "hri_msgs/msg/Skeleton2D"
 """Type of each body's keypoints."""
 
-# A token of a topic's name begins with no digit (design.ros2.org, Topic and Service Names), so no such topic can be.
+# A token of a topic's name does not begin with a digit (design.ros2.org, Topic and Service Names).
 _ID = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-class Tracked:
-    """open(topic) -> what close takes, for each body that comes and goes."""
+class BodyTopics:
+    """Opens a topic for each tracked body, and closes it when the body leaves."""
 
-    def __init__(self, list_topic: str, open: Callable[[str], object], close: Callable[[object], None]) -> None:
-        """list_topic: of the ids; those of the bodies are beside it."""
-        self._beside = list_topic.rpartition("/")[0]
+    def __init__(self, list_topic: str, open: Callable[[str], Any], close: Callable[[Any], Any]) -> None:
+        """Make it without open topics.
+
+        Args:
+            list_topic: topic of the ids; the topics of the bodies are beside it.
+            open: opens a topic by its name; its result is passed to `close`.
+            close: closes an open topic.
+        """
+        self._parent = list_topic.rpartition("/")[0]
         self._open, self._close = open, close
-        self._opened: dict[str, object] = {}
+        self._opened: dict[str, Any] = {}
 
     @property
     def topics(self) -> list[str]:
-        """That are open."""
+        """Names of the open topics."""
         return sorted(self._opened)
 
-    def update(self, ids, most: int) -> list[str]:
-        """Opens the topics of new ids and closes those of ids that are gone; the ids that it cannot follow.
+    def update(self, ids: Iterable[str], limit: int) -> list[str]:
+        """Open the topics of new ids and close those of ids that are gone.
 
-        These are what no topic can be named by, and those beyond the first `most`.
+        Returns:
+            The ids that cannot be followed: no topic can have their name, or they exceed the limit.
         """
         names = list(dict.fromkeys(ids))
-        possible = [name for name in names if _ID.fullmatch(name)][:most]
-        wanted = {f"{self._beside}/{name}/skeleton2d" for name in possible}
+        possible = [name for name in names if _ID.fullmatch(name)][:limit]
+        wanted = {f"{self._parent}/{name}/skeleton2d" for name in possible}
         for topic in self._opened.keys() - wanted:
             self._close(self._opened.pop(topic))
         for topic in sorted(wanted - self._opened.keys()):
@@ -49,5 +57,5 @@ class Tracked:
         return [name for name in names if name not in possible]
 
     def clear(self) -> None:
-        """Closes all."""
+        """Close all topics."""
         self.update([], 0)

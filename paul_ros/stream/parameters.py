@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node's parameters, once: descriptors, config/lifter.yaml and the README's table all come from here."""
+"""The table of the node's parameters: descriptors, config/lifter.yaml and the reference page are made from it."""
 
 from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
+from typing import Any
 
 import yaml
 
@@ -13,26 +14,34 @@ from paul_ros.errors import ParameterError
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter. `limits`: inclusive (low, high) of a number; `live`: may change while the node runs.
+    """One parameter.
 
-    `least`: of a number that 0 turns off, the lowest other that makes sense.
+    Attributes:
+        name: of the parameter.
+        default: its default, which also fixes its type.
+        description: its meaning, with the unit.
+        limits: lowest and highest allowed number; None for other types.
+        live: whether it may change while the node runs.
+        least: lowest allowed number above 0, for numbers that 0 turns off.
     """
 
     name: str
     default: str | int | float | bool
     description: str
-    limits: tuple | None = None
+    limits: tuple[float, float] | None = None
     live: bool = False
     least: float | None = None
 
     @property
     def range(self) -> str:
-        """In words, of one with limits."""
+        """The allowed numbers in words; '' without limits."""
+        if self.limits is None:
+            return ""
         low, high = self.limits
         return f"{low} to {high}" if self.least is None else f"{low:g} or {self.least} to {high}"
 
-    def allows(self, value) -> bool:
-        """Whether it can have a value of its type."""
+    def allows(self, value: Any) -> bool:
+        """Return whether a value of the right type is in range."""
         if self.limits is None:
             return True
         low, high = self.limits
@@ -43,39 +52,39 @@ PARAMETERS = (
     Parameter(
         "autostart",
         True,
-        "Configure and activate at once; false = wait for the transitions of a managed node, as `ros2 lifecycle` asks "
-        "for them.",
+        "Configure and activate at the start. Set false to manage the node by its transitions (`ros2 lifecycle`).",
     ),
     Parameter(
         "model",
         "human",
-        "Model file: the name of one that is shipped, or a path to a .npz, which is read anew each time it is set.",
+        "Name of a shipped model, or path of a .npz file. Setting it reads the file again.",
         live=True,
     ),
     Parameter(
         "layout",
         "",
-        "Keypoint layout of the input: a name, or a path to a .yaml; empty = found from the first message that shows "
-        "somebody.",
+        "Keypoint layout of the input: a name, or the path of a .yaml file. If empty, it is found from the first "
+        "message that shows a person.",
         live=True,
     ),
     Parameter(
         "output_layout",
         "",
-        "Keypoint layout of the output: a name, or a path to a .yaml, of whose points the model has all; model = all "
-        "points of the model; empty = the input's, or the model's where that lacks a point of the input's.",
+        "Keypoint layout of the output: a name, or the path of a .yaml file; the model must have all its points. "
+        "`model` publishes all points of the model. If empty, it is the input's layout, or the model's if that lacks a "
+        "point of the input's.",
         live=True,
     ),
     Parameter(
         "input_type",
         "auto",
-        "Message type of `keypoints`, as sensor_msgs/msg/PointCloud2; "
-        "auto = the type of the first publisher that can be read, or of the next when that has gone.",
+        "Message type of `keypoints`, for example sensor_msgs/msg/PointCloud2. `auto` takes the type of the first "
+        "publisher that can be read, and looks again when that publisher is gone.",
     ),
     Parameter(
         "person_height",
         0.0,
-        "Metres, the height of the people in view where it is known, as of children; 0 = the model's adults.",
+        "Height of the people in view in metres, for example of children. 0 assumes the adults of the model.",
         (0.0, 3.0),
         live=True,
         least=0.3,
@@ -83,31 +92,44 @@ PARAMETERS = (
     Parameter(
         "smoothing",
         0.0,
-        "Hz, cut-off of a filter over time for persons at rest (one-euro, not part of PAUL; it needs person ids): the "
-        "lower the smoother, 1.0 is a good start; 0 = off, every frame for itself.",
+        "Cut-off in Hz of a one-euro filter over time, for a person at rest; 1.0 is a good start, lower is smoother. "
+        "It needs person ids and is not part of PAUL. 0 turns it off.",
         (0.0, 100.0),
         live=True,
     ),
     Parameter(
         "publish_tf",
         False,
-        "Publish on /tf the pose of ~/bodies as body_ID, of every person with an id (REP-155); it needs tf2_msgs, and "
-        "metres.",
+        "Publish the pose of each person with an id as frame body_ID on /tf (REP-155). It needs tf2_msgs and metres.",
     ),
-    Parameter("min_confidence", 0.3, "Keypoints with a lower confidence count as hidden.", (0.0, 1.0), live=True),
+    Parameter("min_confidence", 0.3, "Keypoints of lower confidence are hidden.", (0.0, 1.0), live=True),
     Parameter(
-        "max_persons", 64, "Messages with more persons are dropped, counted as too_many_persons.", (1, 10000), live=True
+        "max_persons",
+        64,
+        "Largest number of persons in a message. Messages with more are dropped and counted as too_many_persons.",
+        (1, 10000),
+        live=True,
     ),
 )
 
-#: Names of those that may change while the node runs.
+#: Names of the parameters that may change while the node runs.
 LIVE = tuple(parameter.name for parameter in PARAMETERS if parameter.live)
 #: Name -> default.
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 
 
-def checked(values: dict) -> dict:
-    """Values by name, the defaults of the others added; raises ParameterError for a number out of its limits."""
+def checked(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values by name with the defaults of all others.
+
+    Raises:
+        ParameterError: a name is unknown, or a number is out of its range.
+    """
+    for name in values.keys() - DEFAULTS.keys():
+        import difflib  # its import would cost the node 9 ms at every start
+
+        near = difflib.get_close_matches(name, DEFAULTS, 1)
+        advice = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(DEFAULTS)}"
+        raise ParameterError(f"there is no parameter '{name}'; {advice}")
     for parameter in PARAMETERS:
         value = values.get(parameter.name, parameter.default)
         if not parameter.allows(value):
@@ -116,36 +138,35 @@ def checked(values: dict) -> dict:
 
 
 def as_yaml() -> str:
-    """config/lifter.yaml: every parameter with its default and its description."""
+    """Return config/lifter.yaml: every parameter with its default and its description."""
     blocks = [
         "# Parameters of the lifter, with their defaults. Made from paul_ros/stream/parameters.py by\n"
         "# python -m paul_ros.stream.parameters > config/lifter.yaml\n"
         "/**:\n  ros__parameters:\n"
     ]
     for parameter in PARAMETERS:
-        comment = textwrap.wrap(f"{parameter.description} ({_kind(parameter)})", 100)
+        comment = textwrap.wrap(f"{parameter.description} ({_changeable(parameter)})", 100)
         value = yaml.safe_dump({parameter.name: parameter.default}).strip()
         blocks.append("".join(f"    # {line}\n" for line in comment) + f"    {value}\n")
     return "".join(blocks)
 
 
 def as_markdown() -> str:
-    """The README's table of parameters."""
-    rows = [f"| `{p.name}` | `{_value(p)}` | {_kind(p)} | {p.description} |" for p in PARAMETERS]
+    """Return the table of parameters for the documentation."""
+    rows = [f"| `{p.name}` | `{_literal(p)}` | {_changeable(p)} | {p.description} |" for p in PARAMETERS]
     return "\n".join(["| parameter | default | may be set | meaning |", "|---|---|---|---|", *rows]) + "\n"
 
 
-def _value(parameter: Parameter) -> str:
-    """The default, as YAML and the command line have it."""
+def _literal(parameter: Parameter) -> str:
+    """Return the default as YAML and the command line write it."""
     default = parameter.default
     return repr(default) if isinstance(default, str) else str(default).lower()
 
 
-def _kind(parameter: Parameter) -> str:
+def _changeable(parameter: Parameter) -> str:
+    """Return when a parameter may be set, and its range."""
     when = "at any time" if parameter.live else "at start"
-    if parameter.limits is None:
-        return when
-    return f"{when}, {parameter.range}"
+    return f"{when}, {parameter.range}" if parameter.limits else when
 
 
 if __name__ == "__main__":

@@ -1,50 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layout of a detector, found from its messages where nobody says it."""
+"""The route of a keypoint: from the detector's layout to the model's, and on to the output's.
+
+Layouts are mapped by the names of their points, so one model serves every detector. Points that a detector lacks are
+hidden, and the model completes them.
+"""
 
 from __future__ import annotations
 
-import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-import msg_adapters
-from msg_adapters import Keypoints2D, Source, WrongPointCount
+import numpy as np
+
+from msg_adapters import Keypoints2D
 from paul_ros.errors import LayoutError
-from paul_ros.layout import Layout, layout_names, load_layout
+from paul_ros.layout import Layout, Mapping
+from paul_ros.lifter import Lifted
 
-PREFERRED = ("coco17", "h36m17", "openpose18", "body25", "mediapipe33")
-"""Of the shipped layouts with as many points as a message has, the first of these is taken, then any other."""
+MODEL = "model"
+"""Value of `output_layout` that stands for the model's own layout."""
 
 
-def read_unknown(model: Layout, type_name: str, msg, source: Source) -> tuple[Keypoints2D, Layout]:
-    """A message of which nobody said the layout, and the layout that it was read in.
+@dataclass(frozen=True)
+class Route:
+    """The two mappings between three layouts.
 
-    That is the one whose points the message names, if the model shares enough of them; else the model's own if the
-    number of points is right for it; else the first shipped layout of that number that maps onto the model, in the
-    order of PREFERRED. Raises MessageError as `msg_adapters.read` does; WrongPointCount where none has the number.
+    Attributes:
+        into: from the input's layout to the model's.
+        out: from the model's layout to the output's; the model has all points of the output.
     """
-    refusal: WrongPointCount | None = None
-    for layout in _candidates(model, msg_adapters.named_layout(type_name, msg)):
-        try:
-            return msg_adapters.read(type_name, msg, len(layout.names), replace(source, names=layout.names)), layout
-        except WrongPointCount as error:
-            refusal = refusal or error
-    raise refusal
+
+    into: Mapping
+    out: Mapping
+
+    @classmethod
+    def between(cls, given: Layout, model: Layout, output: Layout | None = None) -> Route:
+        """Make the route between layouts.
+
+        Args:
+            given: layout of the input.
+            model: layout of the model.
+            output: layout of the output; None = the input's if the model has all its points, else the model's.
+
+        Raises:
+            LayoutError: input and model have too few points in common, or the model lacks a point of the output.
+        """
+        return cls(given.map_to(model), _outward(model, given, output))
+
+    @property
+    def given(self) -> Layout:
+        """The input's layout."""
+        return self.into.source
+
+    @property
+    def output(self) -> Layout:
+        """The output's layout."""
+        return self.out.target
+
+    def keypoints_in(self, keypoints: Keypoints2D, min_confidence: float) -> Keypoints2D:
+        """Map keypoints from the input's layout to the model's; hide those of low confidence."""
+        sure = keypoints.visible & (keypoints.confidence >= min_confidence)
+        xy, confidence, visible = self.into(keypoints.xy, keypoints.confidence, sure)
+        return replace(keypoints, xy=xy, confidence=np.where(visible, confidence, 0.0), visible=visible)
+
+    def keypoints_out(self, keypoints: Keypoints2D) -> Keypoints2D:
+        """Map keypoints from the model's layout to the output's."""
+        xy, confidence, visible = self.out(keypoints.xy, keypoints.confidence, keypoints.visible)
+        return replace(keypoints, xy=xy, confidence=confidence, visible=visible)
+
+    def lifted_out(self, lifted: Lifted) -> Lifted:
+        """Map the points from the model's layout to the output's; root and `used` stay the model's."""
+        return replace(lifted, points=self.out.values(lifted.points))
+
+    def points_out(self, points: np.ndarray) -> np.ndarray:
+        """Map 3D points (N,P,3) from the input's layout to the output's, (N,Q,3); NaN for those the input lacks."""
+        return self.out.values(self.into.values(points))
 
 
-def _candidates(model: Layout, named: str | None) -> list[Layout]:
-    fitting = {layout.name: layout for layout in _shipped() if _maps(layout, model)}
-    first = [fitting[named]] if named in fitting else []
-    return [*first, model, *fitting.values()]
+def _outward(model: Layout, given: Layout, output: Layout | None) -> Mapping:
+    lacking = missing(model, output or given)
+    if output is None:
+        return model.map_to(model if lacking else given)
+    if lacking:
+        raise LayoutError(
+            f"output_layout '{output.name}': the model's layout '{model.name}' has no {', '.join(lacking)}; "
+            f"choose one whose points it has, or '{MODEL}' for all points of the model"
+        )
+    return model.map_to(output)
 
 
-@functools.cache
-def _shipped() -> tuple[Layout, ...]:
-    """In the order of PREFERRED. Reading them takes a tenth of a second."""
-    return tuple(load_layout(name) for name in dict.fromkeys([*PREFERRED, *layout_names()]))
-
-
-def _maps(layout: Layout, model: Layout) -> bool:
-    try:
-        return bool(layout.map_to(model))
-    except LayoutError:
-        return False
+def missing(model: Layout, target: Layout) -> list[str]:
+    """Return the names of the target's points that the model's layout neither has nor derives."""
+    return [name for name in target.names if name not in model.names and name not in model.derived]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one-euro filter over time, for every person by its id; outside of PAUL, which lifts each frame for itself.
+"""The one-euro filter over time, for each person with an id. It is not part of PAUL, which lifts each frame on its own.
 
 G. Casiez, N. Roussel and D. Vogel, 1 Euro Filter: A Simple Speed-based Low-pass Filter for Noisy Input in Interactive
-Systems, CHI 2012. A low-pass filter whose cut-off rises with speed: at rest it takes the jitter away, in motion it does
-not lag behind. Here the speed is that of a point in space, in sizes of its person per second, so that one setting does
-for metres and model units, children and adults.
+Systems, CHI 2012. The cut-off of this low-pass filter rises with speed: it removes jitter at rest and does not lag in
+motion. Here the speed is that of a point in space, in sizes of its person per second. So one setting serves metres and
+model units, children and adults.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ import numpy as np
 from paul_ros.lifted import Lifted
 
 SPEED_COEFFICIENT = 2.0
-"""Hz that the cut-off rises by at a speed of one size per second; a person's size is the rms distance of its points
-from their mean. With 1 Hz at rest the accelerations in the bags fall from 58 to 23 mm a frame squared with noise, 13 to
-9 without (truth: 3 and 5), and N-MPJPE changes by less than a millimetre; half the coefficient lags behind."""
+"""Rise of the cut-off in Hz at a speed of one size per second; a person's size is the rms distance of its points from
+their mean. With 1 Hz at rest the accelerations in the bags fall from 58 to 23 mm per frame squared with noise, and from
+13 to 9 without (truth: 3 and 5). N-MPJPE changes by less than a millimetre. Half the coefficient lags behind."""
 
 SPEED_CUTOFF = 1.0
-"""Hz, of the speed's own filter; the paper's."""
+"""Cut-off of the speed's own filter in Hz, as in the paper."""
 
 FORGET_SECONDS = 0.5
-"""A person that was not lifted for longer starts anew."""
+"""Time after which the track of a person that was not lifted starts anew."""
 
 
 class _Track(NamedTuple):
-    """stamp in ns; points (P,3) and their speeds (P,3) per second, both filtered."""
+    """A filtered person: stamp in ns, points (P,3), and their speeds (P,3) per second."""
 
     stamp: int
     points: np.ndarray
@@ -37,7 +37,11 @@ class _Track(NamedTuple):
 
 
 class OneEuro:
-    """cutoff: Hz, of a person at rest; 0 = the filter is off."""
+    """The filters of all persons.
+
+    Attributes:
+        cutoff: Hz, for a person at rest; 0 = the filter is off.
+    """
 
     def __init__(self, cutoff: float = 0.0) -> None:
         self.cutoff = cutoff
@@ -45,9 +49,10 @@ class OneEuro:
         self._stamp, self._units, self._swept = 0, "", 0
 
     def __call__(self, ids: tuple[str, ...], stamp: int, lifted: Lifted, root: tuple[int, ...]) -> Lifted:
-        """Persons with their points filtered, and their roots, means of the points `root`; without an id as they are.
+        """Filter the points of persons with an id; their roots become the mean of the points `root`.
 
-        All start anew where time runs backwards, as when a bag loops, or is not told (0), or the units are others.
+        All tracks start anew if time runs backwards, as when a bag loops, if the stamp is missing (0), or if the units
+        changed.
         """
         if stamp < self._stamp or not stamp or lifted.units != self._units or not self.cutoff:
             self._tracks.clear()
@@ -64,7 +69,7 @@ class OneEuro:
         return replace(lifted, points=points, root=roots)
 
     def _sweep(self) -> None:
-        """Forgets the persons who left, from time to time: detectors count ids upwards for as long as they run."""
+        """Forget persons who left, from time to time: detectors count ids upwards for as long as they run."""
         longest = int(FORGET_SECONDS * 1e9)
         if not 0 <= self._stamp - self._swept <= longest:
             self._swept = self._stamp
@@ -72,14 +77,14 @@ class OneEuro:
 
     def _step(self, track: _Track | None, stamp: int, points: np.ndarray) -> _Track:
         seconds = (stamp - track.stamp) / 1e9 if track else 0.0
-        if not 0 < seconds <= FORGET_SECONDS:
+        if track is None or not 0 < seconds <= FORGET_SECONDS:
             return _Track(stamp, points.copy(), np.zeros_like(points))
-        speed = track.speed + _share(SPEED_CUTOFF, seconds) * ((points - track.points) / seconds - track.speed)
+        speed = track.speed + _blend_factor(SPEED_CUTOFF, seconds) * ((points - track.points) / seconds - track.speed)
         size = np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean())
         cutoff = self.cutoff + SPEED_COEFFICIENT * np.linalg.norm(speed, axis=1, keepdims=True) / max(size, 1e-12)
-        return _Track(stamp, track.points + _share(cutoff, seconds) * (points - track.points), speed)
+        return _Track(stamp, track.points + _blend_factor(cutoff, seconds) * (points - track.points), speed)
 
 
-def _share(cutoff, seconds: float):
-    """Of a new value in a low-pass filter of first order."""
+def _blend_factor(cutoff: np.ndarray | float, seconds: float) -> np.ndarray | float:
+    """Return the blend factor (alpha) of a first-order low-pass filter: its cut-off in Hz, its step in seconds."""
     return 1.0 / (1.0 + 1.0 / (2 * np.pi * cutoff * seconds))

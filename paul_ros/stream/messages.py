@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The outputs: which messages a frame becomes, and how each is built."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from msg_adapters import Intrinsics, outputs
+from msg_adapters.cdr import CloudWriter, PoseArrayWriter
+from paul_ros.body_axes import Steady
+from paul_ros.stream.frame import Frame
+
+Attitudes = Callable[[], np.ndarray]
+"""Returns (N,4) quaternions of the body axes; not called by outputs that have no attitudes."""
+
+
+class Make(Protocol):
+    """A factory of message objects of one family: rclpy's classes or rosbags' dataclasses."""
+
+    def __call__(self, type_name: str, **fields: Any) -> Any:
+        """Build a message of a type such as 'std_msgs/msg/String' from all its fields."""
+
+    def octets(self, data: bytes) -> Any:
+        """Convert bytes to the value of a uint8[] field."""
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A way to build an output as serialised bytes, at about a tenth of the cost.
+
+    Attributes:
+        writer: makes a writer(header, values) -> bytes, one for each output that is published.
+        values: what the writer gets of a frame.
+    """
+
+    writer: Callable[[], Callable[[Any, np.ndarray], bytes]]
+    values: Callable[[Frame], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Output:
+    """One output topic of the node.
+
+    Attributes:
+        name: name in this package, and of the topic below the node's name in bags.
+        message_type: type of its messages.
+        build: makes the message object of a frame; persons that were not lifted are left out.
+        topic: of the node.
+        packed: how to build serialised bytes instead; None = only as an object.
+        optional: whether the node runs without the message package.
+        parameter: boolean parameter that asks for this output; '' = none is needed.
+    """
+
+    name: str
+    message_type: str
+    build: Callable[[Make, Frame, Attitudes], Any]
+    topic: str
+    packed: Packed | None = None
+    optional: bool = False
+    parameter: str = ""
+
+
+def _poses(make: Make, frame: Frame, _: Attitudes) -> Any:
+    return outputs.pose_array(make, frame.header, _lifted_points(frame))
+
+
+def _bodies(make: Make, frame: Frame, attitudes: Attitudes) -> Any:
+    ok = frame.lifted.ok
+    return outputs.body_array(make, frame.header, frame.lifted.root[ok], attitudes()[ok])
+
+
+def _keypoints3d(make: Make, frame: Frame, _: Attitudes) -> Any:
+    return outputs.points_cloud(make, frame.header, *_point_columns(frame))
+
+
+def _markers(make: Make, frame: Frame, _: Attitudes) -> Any:
+    ok, layout = frame.lifted.ok, frame.layout
+    points, visible = frame.lifted.points[ok], frame.keypoints.visible[ok]
+    return outputs.skeleton_markers(make, frame.header, points, visible, layout.edges, layout.sides, frame.bone_width)
+
+
+def _transforms(make: Make, frame: Frame, attitudes: Attitudes) -> Any:
+    # Frames are in metres (REP-103), so persons in model units have none.
+    metric = frame.metric
+    ids = [ident for ident, good in zip(frame.keypoints.ids, metric) if good]
+    return outputs.body_transforms(make, frame.header, ids, frame.lifted.root[metric], attitudes()[metric])
+
+
+def _annotations(make: Make, frame: Frame, _: Attitudes) -> Any:
+    metric, layout = frame.metric, frame.layout
+    pixels = project(frame.lifted.points[metric], frame.camera)
+    visible = frame.keypoints.visible[metric]
+    return outputs.image_annotations(make, frame.header, pixels, visible, layout.edges, layout.sides)
+
+
+def _lifted_points(frame: Frame) -> np.ndarray:
+    return frame.lifted.points[frame.lifted.ok]
+
+
+def _point_columns(frame: Frame) -> tuple[np.ndarray, ...]:
+    """Return points, confidence, ids, ambiguity and distance_sigma of the lifted persons."""
+    lifted, ok = frame.lifted, frame.lifted.ok
+    # An id that is not a number becomes its row of the input, so rows are numbered before any is left out.
+    ids = outputs.id_numbers(frame.keypoints.ids)[ok]
+    return lifted.points[ok], frame.keypoints.confidence[ok], ids, lifted.ambiguity[ok], lifted.distance_sigma[ok]
+
+
+def _point_values(frame: Frame) -> np.ndarray:
+    return outputs.point_values(*_point_columns(frame))
+
+
+def project(points: np.ndarray, camera: Intrinsics | None) -> np.ndarray:
+    """Project points (...,3) of the camera's frame to pixels (...,2); NaN behind the camera, or without one."""
+    pixels = np.full((*points.shape[:-1], 2), np.nan)
+    if camera is None:
+        return pixels
+    ahead = points[..., 2] > 0
+    x, y, z = points[ahead].T
+    pixels[ahead] = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    return pixels
+
+
+_TABLE = (
+    Output("poses", "geometry_msgs/msg/PoseArray", _poses, "~/poses", Packed(PoseArrayWriter, _lifted_points)),
+    Output("bodies", "geometry_msgs/msg/PoseArray", _bodies, "~/bodies"),
+    Output(
+        "keypoints3d",
+        "sensor_msgs/msg/PointCloud2",
+        _keypoints3d,
+        "~/keypoints3d",
+        Packed(functools.partial(CloudWriter, outputs.POINT_FIELDS), _point_values),
+    ),
+    Output("markers", "visualization_msgs/msg/MarkerArray", _markers, "~/markers"),
+    Output("transforms", "tf2_msgs/msg/TFMessage", _transforms, "/tf", optional=True, parameter="publish_tf"),
+    Output("annotations", "foxglove_msgs/msg/ImageAnnotations", _annotations, "~/annotations", optional=True),
+)
+
+OUTPUTS: dict[str, Output] = {output.name: output for output in _TABLE}
+"""Name -> Output, all of them."""
+
+STANDARD = tuple(output.name for output in _TABLE if not output.optional)
+"""Names of the outputs that every node and every replay has."""
+
+
+class MessageBuilder:
+    """Builds the output messages of frames that follow each other.
+
+    q and -q are one attitude. The builder keeps each person's quaternion sign continuous over the frames that it builds
+    attitudes for, so one stream of frames needs one builder.
+    """
+
+    def __init__(
+        self, make: Make, packed: bool = False, convert_header: Callable[[Any], Any] = lambda header: header
+    ) -> None:
+        """Make a builder.
+
+        Args:
+            make: factory of message objects.
+            packed: whether outputs that have a packed form are built as bytes.
+            convert_header: converts a frame's header for message objects, if `make` needs one of its own family.
+        """
+        self._make = make
+        self._convert_header = convert_header
+        self._continuous_signs = Steady()
+        self._writers = {
+            name: (output.packed.writer(), output.packed.values)
+            for name, output in OUTPUTS.items()
+            if packed and output.packed
+        }
+
+    def messages(self, frame: Frame, names: Iterable[str] = STANDARD) -> dict[str, Any]:
+        """Build the outputs of these names; name -> message object, or bytes."""
+        names = list(names)
+        built: dict[str, Any] = {}
+        for name in names:
+            if name in self._writers:
+                writer, values = self._writers[name]
+                built[name] = writer(frame.header, values(frame))
+        if len(built) < len(names):
+            # All outputs of a frame share one settlement of the signs.
+            attitudes = functools.cache(lambda: self._continuous_signs(frame.keypoints.ids, frame.attitudes))
+            with_header = replace(frame, header=self._convert_header(frame.header))
+            built |= {
+                name: OUTPUTS[name].build(self._make, with_header, attitudes) for name in names if name not in built
+            }
+        return built

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The session of a stream: all that it remembers from message to message, whichever model and layouts lift them."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import Any
+
+from msg_adapters import Intrinsics, read_camera_info
+from paul_ros.stream.depth import DepthBuffer
+from paul_ros.stream.ledger import Ledger
+from paul_ros.stream.reasons import REASONS
+
+_LIFT_TIMES_KEPT = 1000
+"""Number of lift times kept for the median and the 99th percentile: the last half minute at 30 Hz."""
+
+
+class Session:
+    """The camera, its depth images and all counts. A stream with another model or layout continues the same session.
+
+    Attributes:
+        intrinsics: of the last usable CameraInfo; None before the first.
+        image_size: width and height in pixels of the last CameraInfo, calibrated or not; None before the first.
+        camera_frame: frame_id of the last CameraInfo; '' before the first.
+        depths: the last depth images.
+        ledger: counts of drops and notes.
+        counts: numbers of frames, of their persons, and of the persons that were lifted.
+        lift_us: the last lift times in microseconds, of frames with persons.
+    """
+
+    def __init__(self) -> None:
+        self.intrinsics: Intrinsics | None = None
+        self.image_size: tuple[int, int] | None = None
+        self.camera_frame = ""
+        self.depths = DepthBuffer()
+        self.ledger = Ledger()
+        self.counts: Counter[str] = Counter(frames=0, persons=0, lifted=0)
+        self.lift_us: deque[float] = deque(maxlen=_LIFT_TIMES_KEPT)
+        self._last_stamp: int | None = None
+
+    def take_camera_info(self, msg: Any) -> None:
+        """Store the camera of a CameraInfo.
+
+        Raises:
+            MessageError: the intrinsics are unusable. Size and frame are stored, and earlier intrinsics stay in use.
+        """
+        # An uncalibrated camera has a size and a frame too.
+        self.image_size, self.camera_frame = (int(msg.width), int(msg.height)), str(msg.header.frame_id)
+        self.intrinsics = read_camera_info(msg)
+        if self.intrinsics.distorted:
+            self.ledger.note("distorted_image", REASONS["distorted_image"].advice)
+
+    def check_header(self, stamp: int, frame_id: str) -> None:
+        """Note a stamp (nanoseconds) that runs backwards, and a frame that is not the camera's."""
+        if self._last_stamp is not None and stamp < self._last_stamp:
+            self.ledger.note("stamp_backwards")
+        self._last_stamp = stamp
+        # The image and the CameraInfo of one camera have one frame, its optical frame (REP-104).
+        if self.camera_frame and frame_id != self.camera_frame:
+            self.ledger.note(
+                "another_frame",
+                f"The keypoints' frame_id is {frame_id!r}, CameraInfo's {self.camera_frame!r}. "
+                f"{REASONS['another_frame'].fix}",
+            )
