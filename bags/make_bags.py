@@ -23,7 +23,7 @@ sys.path.insert(0, str(HERE.parent))  # run from a checkout that nobody installe
 from msg_adapters.outputs import keypoints_cloud, pose_array  # noqa: E402
 from paul_ros.layout import load_layout  # noqa: E402
 from paul_ros.offline.bag import BagMessages, BagWriter  # noqa: E402
-from training.people.mocap import layout_points  # noqa: E402
+from training.people.human_points import layout_points
 
 RATE = 30  # Hz
 START = 1_750_000_000 * 1_000_000_000  # ns; any time will do

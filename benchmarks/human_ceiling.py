@@ -22,7 +22,7 @@ from training.data import load_training_data
 from training.export import export_model
 from training.judge.truth import load_sequence
 from training.people.human_data import make_file
-from training.people.mocap import human_layout
+from training.people.human_points import human_layout
 from training.recipe import Recipe
 from training.reconstruction import final_loss
 from training.start.kept_start import START_UNIT, Start, kept_start, start_identity

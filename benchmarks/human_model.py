@@ -30,8 +30,10 @@ from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifted, Lifter
 from paul_ros.model import DEFAULT_MODEL, load_model
 from training.judge.pictures import COLOURS, new_figure, save_figure, titled
-from training.people.human_data import HELD_OUT, Seen, read_clips, see
-from training.people.mocap import human_layout, human_points
+from training.people.clips import read_clips
+from training.people.human_data import Seen, see
+from training.people.human_points import human_layout, human_points
+from training.people.poses import HELD_OUT
 from training.recipe import Recipe
 
 LAYOUTS = ("coco17", "body25", "openpose18", "h36m17", "mediapipe33")

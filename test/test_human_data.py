@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training views of people: points on the body, cameras, a detector's errors, layouts, and the command."""
+"""Training views of people: points on the body, cameras, a detector's errors, layouts, files and the command."""
 
 from __future__ import annotations
 
@@ -25,13 +25,15 @@ from training.errors import DataError, MocapError, RecipeError, ViewsError
 from training.people import human_data
 from training.people.cameras import hidden_by_body, random_cameras
 from training.people.detector import detect, redefined, reported
-from training.people.human_data import other_people, see
-from training.people.mocap import CMU31, PARENTS, human_layout, human_mapping, human_points, layout_points
-from training.people.view_settings import COMPLETE, Views
+from training.people.human_points import human_layout, human_mapping, human_points, layout_points
+from training.people.mocap import CMU31, PARENTS
+from training.people.poses import other_people
+from training.people.simulated_views import image_heights, simulate_views
+from training.people.view_settings import COMPLETE, ViewSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = ROOT / "bags" / "source"
-TRUE = Views(level=(0, 0), hidden=(0, 0), obstacle=0, border=False, layouts=((COMPLETE, 1),))
+TRUE = ViewSettings(level=(0, 0), hidden=(0, 0), obstacle=0, border=False, layouts=((COMPLETE, 1),))
 """True projections of all points."""
 place = human_layout().names.index
 
@@ -51,7 +53,7 @@ def bodies(joints):
 @pytest.fixture(scope="module")
 def crowd(joints):
     """(N,43,3), enough for shares of a per cent."""
-    return human_points(other_people(np.tile(joints, (8, 1, 1)), Views(), np.random.default_rng(1)))
+    return human_points(other_people(np.tile(joints, (8, 1, 1)), ViewSettings(), np.random.default_rng(1)))
 
 
 # --- points on the body
@@ -137,7 +139,7 @@ def test_parents_are_those_of_the_skeleton(joints):
 
 
 def test_other_people_keep_their_poses(joints):
-    grown = other_people(joints, Views(), np.random.default_rng(0))
+    grown = other_people(joints, ViewSettings(), np.random.default_rng(0))
     for bone, parent in enumerate(PARENTS):
         if parent >= 0:
             was, now = joints[:, bone] - joints[:, parent], grown[:, bone] - grown[:, parent]
@@ -150,7 +152,7 @@ def test_other_people_keep_their_poses(joints):
     ]
     np.testing.assert_allclose(*ratio)  # both sides alike
     assert 1.1 < np.median(ratio) < 1.4 and np.std(np.log(ratio)) > 0.1
-    same = replace(Views(), stature=0.0, proportions=0.0, forearm=(1.0, 1.0))
+    same = replace(ViewSettings(), stature=0.0, proportions=0.0, forearm=(1.0, 1.0))
     np.testing.assert_allclose(other_people(joints, same, np.random.default_rng(0)), joints, atol=1e-9)
 
 
@@ -158,7 +160,7 @@ def test_other_people_keep_their_poses(joints):
 
 
 def test_a_view_is_what_a_camera_would_see(bodies):
-    seen = see(bodies, TRUE, np.random.default_rng(0))
+    seen = simulate_views(bodies, TRUE, np.random.default_rng(0))
     cameras = seen.cameras
     np.testing.assert_allclose(np.linalg.det(cameras.R), 1)
     lengths = np.linalg.norm(seen.points[:, 1:] - seen.points[:, :-1], axis=2)
@@ -171,7 +173,7 @@ def test_a_view_is_what_a_camera_would_see(bodies):
 
 
 def test_rays_are_those_of_the_lifter_and_the_truth_lies_on_them(bodies):
-    seen = see(bodies[:50], TRUE, np.random.default_rng(0))
+    seen = simulate_views(bodies[:50], TRUE, np.random.default_rng(0))
     for k in range(50):
         camera = Intrinsics(*[seen.cameras.focal[k]] * 2, *seen.cameras.centre[k], 0, 0)
         view = centred_view(seen.xy[k : k + 1], seen.visible[k : k + 1], camera)
@@ -183,7 +185,7 @@ def test_rays_are_those_of_the_lifter_and_the_truth_lies_on_them(bodies):
 
 
 def test_cameras_stand_where_the_settings_say(bodies):
-    views = Views(aloft=0.0, height=(0.3, 1.8), distance=(2.0, 6.0), tilted=0.0)
+    views = ViewSettings(aloft=0.0, height=(0.3, 1.8), distance=(2.0, 6.0), tilted=0.0)
     cameras = random_cameras(bodies, views, np.random.default_rng(0))
     station = cameras.anchor - np.einsum("nji,nj->ni", cameras.R, cameras.place)  # in the world
     distance = np.linalg.norm(cameras.place, axis=1)
@@ -199,14 +201,14 @@ def test_cameras_stand_where_the_settings_say(bodies):
 
 
 def test_cameras_aloft_look_down(bodies):
-    views = Views(aloft=1.0, elevation=(20.0, 50.0), off_axis=0.0)
+    views = ViewSettings(aloft=1.0, elevation=(20.0, 50.0), off_axis=0.0)
     cameras = random_cameras(bodies, views, np.random.default_rng(0))
     down = np.rad2deg(np.arcsin(cameras.R[:, 2] @ [0, -1, 0]))
     assert 19.5 < down.min() and down.max() < 50.5
 
 
 def test_what_is_outside_the_image_is_not_seen(bodies):
-    seen = see(bodies, replace(TRUE, border=True, distance=(1.5, 2.5)), np.random.default_rng(0))
+    seen = simulate_views(bodies, replace(TRUE, border=True, distance=(1.5, 2.5)), np.random.default_rng(0))
     xy = seen.cameras.project(seen.points)
     outside = ((xy < 0) | (xy >= seen.cameras.size[:, None])).any(2)
     assert 0.05 < outside.mean() < 0.5 and not (seen.visible & outside).any()
@@ -262,9 +264,9 @@ def _star() -> np.ndarray:
 
 def _errors(crowd, views):
     """Errors (N,43) in per cent of the height, of all points."""
-    seen = see(crowd, views, np.random.default_rng(2))
+    seen = simulate_views(crowd, views, np.random.default_rng(2))
     off = np.linalg.norm(seen.xy - seen.cameras.project(seen.points), axis=2)
-    return 100 * off / human_data._height(seen.cameras, seen.points)[:, None], seen
+    return 100 * off / image_heights(seen.cameras, seen.points)[:, None], seen
 
 
 LEVEL_1 = replace(TRUE, level=(1, 1), min_confidence=0.0, guessed=1.0)
@@ -291,7 +293,7 @@ def test_left_and_right_are_exchanged_as_often_as_measured():
     """Points far apart and errors small beside that, so that an exchange shows."""
     N, names = 40_000, human_layout().names
     xy = np.broadcast_to(np.arange(43)[:, None] * [1e4, 0], (N, 43, 2))
-    found = detect(xy, np.ones(N), np.zeros((N, 43), bool), np.ones(N), Views(), np.random.default_rng(0))
+    found = detect(xy, np.ones(N), np.zeros((N, 43), bool), np.ones(N), ViewSettings(), np.random.default_rng(0))
     for name, share in (("left_shoulder", 0.006), ("left_wrist", 0.006), ("left_ankle", 0.0125), ("neck", 0)):
         moved = np.abs(found.xy[:, names.index(name)] - xy[:, names.index(name)]).max(1) > 5e3
         assert moved.mean() == pytest.approx(share, abs=0.0015)
@@ -306,7 +308,7 @@ def test_confidence_goes_with_the_error(crowd):
     good, wild = known & (errors[:, face] < 3), known & (errors[:, face] > 15)
     assert (seen.confidence[good, face] > 0.3).mean() > 0.98
     assert 0.3 < (seen.confidence[wild, face] < 0.3).mean() < 0.7  # some errors look sound
-    doubtful = see(crowd, replace(LEVEL_1, min_confidence=0.3), np.random.default_rng(2))
+    doubtful = simulate_views(crowd, replace(LEVEL_1, min_confidence=0.3), np.random.default_rng(2))
     assert (doubtful.confidence[doubtful.visible] >= 0.3).all()
     assert np.isnan(doubtful.xy[~doubtful.visible]).all()
 
@@ -318,7 +320,7 @@ def test_hidden_points_are_worse_or_missing(crowd):
     limbs = [place(f"{side}_{part}") for side in ("left", "right") for part in ("elbow", "wrist", "knee")]
     clear, guessed = (np.nanmedian(errors[:, limbs][mask[:, limbs]]) for mask in (~behind, behind))
     assert guessed > 1.4 * clear
-    lost = see(crowd, replace(LEVEL_1, guessed=0.25), np.random.default_rng(2)).visible
+    lost = simulate_views(crowd, replace(LEVEL_1, guessed=0.25), np.random.default_rng(2)).visible
     assert lost[behind].mean() == pytest.approx(0.25, abs=0.03) and lost[~behind].mean() > 0.97
 
 
@@ -346,8 +348,8 @@ def test_level_0_is_the_truth_and_between_is_between(crowd):
 
 
 def test_a_detector_reports_the_points_of_its_layout_as_the_node_maps_them(bodies):
-    views = Views(level=(1, 1), layouts=(("coco17", 0.5), ("h36m17", 0.5), (COMPLETE, 0)))
-    seen = see(bodies, views, np.random.default_rng(0))
+    views = ViewSettings(level=(1, 1), layouts=(("coco17", 0.5), ("h36m17", 0.5), (COMPLETE, 0)))
+    seen = simulate_views(bodies, views, np.random.default_rng(0))
     assert set(seen.layout) == {0, 1}
     coco, h36m = seen.visible[seen.layout == 0].any(0), seen.visible[seen.layout == 1].any(0)
     names = np.array(human_layout().names)
@@ -362,9 +364,9 @@ def test_a_detector_reports_the_points_of_its_layout_as_the_node_maps_them(bodie
 
 
 def test_a_share_of_points_is_missing_as_asked_for(crowd):
-    seen = see(crowd, replace(TRUE, hidden=(0.4, 0.4)), np.random.default_rng(0))
+    seen = simulate_views(crowd, replace(TRUE, hidden=(0.4, 0.4)), np.random.default_rng(0))
     assert seen.visible.mean() == pytest.approx(0.6, abs=0.01)
-    cut = see(crowd, replace(TRUE, obstacle=1.0), np.random.default_rng(0))
+    cut = simulate_views(crowd, replace(TRUE, obstacle=1.0), np.random.default_rng(0))
     assert 0.6 < cut.visible.mean() < 0.95 and 0.02 < cut.visible.mean(1).min() < 0.5
 
 
@@ -372,7 +374,7 @@ def test_a_share_of_points_is_missing_as_asked_for(crowd):
 
 
 @pytest.mark.parametrize(
-    "settings, told",
+    "settings, message",
     [
         ({"levels": [0, 1]}, "unknown view setting levels; known are motion"),
         ({"level": [0, 2]}, "level must be at most 1"),
@@ -388,19 +390,19 @@ def test_a_share_of_points_is_missing_as_asked_for(crowd):
         ({"views": 2.5}, "views must be like 6"),
         ({"stature": float("nan")}, "stature must be like"),
         ({"hidden": ["a", "b"]}, "hidden must be two growing numbers"),
-        (["level"], "settings as key: value"),
+        (["level"], r"mapping of settings \(key: value\)"),
     ],
 )
-def test_wrong_settings_are_refused(settings, told):
-    with pytest.raises(ViewsError, match=told):
-        Views.from_dict(settings)
+def test_wrong_settings_are_refused(settings, message):
+    with pytest.raises(ViewsError, match=message):
+        ViewSettings.from_dict(settings)
 
 
 def test_settings_survive_yaml():
-    views = Views.from_dict({"level": [0, 0.5], "layouts": [["coco17", 1]], "views": 2.0, "border": False})
+    views = ViewSettings.from_dict({"level": [0, 0.5], "layouts": [["coco17", 1]], "views": 2.0, "border": False})
     assert views.level == (0, 0.5) and views.layouts == (("coco17", 1),) and views.views == 2 and not views.border
-    assert Views.from_dict(views.to_dict()) == views
-    assert Views.from_dict(Views().to_dict()) == Views()
+    assert ViewSettings.from_dict(views.to_dict()) == views
+    assert ViewSettings.from_dict(ViewSettings().to_dict()) == ViewSettings()
 
 
 def clip(seed, frames=60):
@@ -461,7 +463,7 @@ def test_the_command_makes_what_the_trainer_takes(archive, tmp_path):
 
 def test_the_command_says_what_is_wrong(archive, tmp_path):
     (tmp_path / "empty").mkdir()
-    for arguments, told in (
+    for arguments, message in (
         ((archive, "--set", "views.levels=1"), "unknown view setting levels"),
         ((archive, "--set", "bottleneck.a=1"), "bottleneck has no settings of its own"),
         ((archive, "--recipe", "default"), "--recipe human"),
@@ -469,7 +471,7 @@ def test_the_command_says_what_is_wrong(archive, tmp_path):
         ((archive, "--set", "views.hidden=[1,1]"), "enough points to be lifted: lower views.hidden, which is [1"),
     ):
         wrong = command(*arguments, "-o", tmp_path / "2d.npz", "--quiet")
-        assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and told in wrong.stderr, wrong.stderr
+        assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and message in wrong.stderr, wrong.stderr
 
 
 def test_the_command_overwrites_nothing_that_it_reads_or_writes(archive, tmp_path):
@@ -478,7 +480,7 @@ def test_the_command_overwrites_nothing_that_it_reads_or_writes(archive, tmp_pat
     (tmp_path / "linked").mkdir()
     (tmp_path / "linked" / "a.npz").symlink_to(capture)
     before = capture.read_bytes()
-    for arguments, told in (
+    for arguments, message in (
         ((archive, "-o", capture), "read as motion capture"),
         ((archive, "-o", archive / "new.npz"), "read as motion capture"),
         ((archive, "-o", out, "--truth", archive / "3d.npz"), "read as motion capture"),
@@ -489,14 +491,14 @@ def test_the_command_overwrites_nothing_that_it_reads_or_writes(archive, tmp_pat
         ((archive, "-o", tmp_path / "typo" / "2d.npz"), "there is no folder"),
     ):
         wrong = command(*arguments)
-        assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and told in wrong.stderr, wrong.stderr
+        assert wrong.returncode == 1 and wrong.stderr.count("\n") == 1 and message in wrong.stderr, wrong.stderr
     assert capture.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["archive", "linked"]
 
 
 def test_views_are_made_anew_for_whatever_changes_them_and_only_then(archive, tmp_path, monkeypatch):
     """Corrections keep the size of a file and may keep its time."""
     kept, capture = tmp_path / "views.npz", archive / "subject_90.npz"
-    settings = replace(Views(), views=1)
+    settings = replace(ViewSettings(), views=1)
 
     def made_anew(views=settings):
         before = kept.stat().st_ino if kept.exists() else None
@@ -526,10 +528,10 @@ def test_views_are_made_anew_for_whatever_changes_them_and_only_then(archive, tm
 
 def test_views_of_a_format_are_known(joints):
     """Where this fails, the same files and settings give other views: raise human_data.FORMAT, then these figures."""
-    arrays, _ = human_data.make([("90_01", joints)], replace(Views(), views=1))
+    arrays, _ = human_data.make([("90_01", joints)], replace(ViewSettings(), views=1))
     detected = np.isfinite(arrays["detected"]).all(1)
-    told = len(detected), detected.mean(), np.nanmean(np.abs(arrays["W"])), np.nanmean(np.abs(arrays["detected"]))
-    assert human_data.FORMAT == 1 and told == pytest.approx((281, 0.40578, 0.089666, 0.069461), rel=1e-3)
+    found = len(detected), detected.mean(), np.nanmean(np.abs(arrays["W"])), np.nanmean(np.abs(arrays["detected"]))
+    assert human_data.FORMAT == 1 and found == pytest.approx((281, 0.40578, 0.089666, 0.069461), rel=1e-3)
 
 
 SETTINGS = ("views.views=1", "steps=2", "batch=16", "start=random", "regression_steps=0", "hold=0", "width=16")
@@ -560,7 +562,7 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
     assert cli.run(args) == 0
     model = load_model(tmp_path / "human.npz")
     assert model.layout.name == "human" and model.min_visible == 6
-    assert model.header["training"]["recipe"]["views"] == replace(Views(), views=1).to_dict()
+    assert model.header["training"]["recipe"]["views"] == replace(ViewSettings(), views=1).to_dict()
     views = tmp_path / "human.run" / "views.npz"
     made = views.stat().st_mtime_ns
     assert cli.run(args) == 0 and views.stat().st_mtime_ns == made
@@ -569,16 +571,16 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
 
 
 @pytest.mark.parametrize(
-    "words, error, told",
+    "words, error, message",
     [
         (("--layout", "coco17"), DataError, "43 points of layout human, not the 17 of coco17: leave out --layout"),
         (("--set", "known_lengths=[[left_hip, tail, 0.4]]"), RecipeError, "tail"),
         (("--set", "hold=0", "--set", "steps=0", "--set", "regression_steps=0"), RecipeError, "no networks"),
     ],
 )
-def test_what_can_be_told_is_told_before_views_are_made(archive, tmp_path, monkeypatch, words, error, told):
+def test_errors_that_need_no_views_come_before_views_are_made(archive, tmp_path, monkeypatch, words, error, message):
     monkeypatch.setattr(cli, "make_file", lambda *given, **named: pytest.fail("views were made"))
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         cli.run(arguments_of_train(archive, "-o", tmp_path / "human.npz", "--recipe", "human", *words))
 
 
@@ -599,5 +601,5 @@ def test_one_of_two_processes_makes_the_views(archive, tmp_path):
 def test_what_one_process_cannot_read_stops_both_with_the_same_words(archive, tmp_path):
     (archive / "91_01.bvh").write_text("HIERARCHY")
     wrong = train_together(archive, "-o", tmp_path / "human.npz")
-    told = [line for line in wrong.stderr.splitlines() if "91_01.bvh" in line]
-    assert wrong.returncode == 1 and len(set(told)) == 1 and "broadcast" not in wrong.stderr, wrong.stderr
+    lines = [line for line in wrong.stderr.splitlines() if "91_01.bvh" in line]
+    assert wrong.returncode == 1 and len(set(lines)) == 1 and "broadcast" not in wrong.stderr, wrong.stderr

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from training.errors import MocapError
 from training.people.asf_amc import read_amc, read_asf
 from training.people.bvh import read_bvh
-from training.people.human_data import motion_files, read_clips
+from training.people.clips import motion_files, read_clips
 from training.people.mocap import CMU31, PARENTS
 
 METRES = 0.0254 / 0.45
@@ -121,9 +121,9 @@ def test_radians_other_orders_and_windows_line_ends(archive):
 
 
 ASF_FAULTS = {
-    "lhand": ("lpaw", "no bone 'lhand', this is no skeleton of the CMU archive"),
+    "lhand": ("lpaw", "no bone 'lhand', so this is no skeleton of the CMU archive"),
     "dof ry rz": ("dof ry tz", r":\d+: degree of freedom 'tz'"),
-    "    rhumerus rradius\n": ("", "bone 'r.*' hangs on nothing"),
+    "    rhumerus rradius\n": ("", "bone 'r.*' has no parent"),
     "    lfemur ltibia\n": ("    lfemur lshin\n", r":\d+: 'lshin' under 'lfemur': one of them is no bone"),
     "    lowerback upperback\n": ("    lowerback upperback\n    root upperback\n", "bone 'upperback' has two parents"),
     "angle deg": ("angle grad", "angle deg"),
@@ -136,9 +136,9 @@ ASF_FAULTS = {
 @pytest.mark.parametrize("old", ASF_FAULTS)
 def test_a_wrong_skeleton_is_refused(archive, old):
     _, folder, body = archive
-    new, told = ASF_FAULTS[old]
+    new, message = ASF_FAULTS[old]
     (folder / "07.asf").write_text(body.asf().replace(old, new))
-    with pytest.raises(MocapError, match=told) as refusal:
+    with pytest.raises(MocapError, match=message) as refusal:
         read_asf(folder / "07.asf")
     assert "07.asf" in str(refusal.value)
 
@@ -184,13 +184,13 @@ AMC_FAULTS = {
 @pytest.mark.parametrize("fault", AMC_FAULTS)
 def test_a_wrong_motion_is_refused_by_its_line(archive, fault):
     _, folder, body = archive
-    frame, name, line, told = AMC_FAULTS[fault]
+    frame, name, line, message = AMC_FAULTS[fault]
     lines = body.amc().splitlines()
     begin = lines.index(str(frame))
     place = next(k for k in range(begin, len(lines)) if lines[k].split()[0] == name)
     lines[place : place + 1] = [] if line is None else [line]
     (folder / "07_03.amc").write_text("\n".join(lines))
-    with pytest.raises(MocapError, match=told) as refusal:
+    with pytest.raises(MocapError, match=message) as refusal:
         read_amc(folder / "07_03.amc", read_asf(folder / "07.asf"))
     if number := re.search(r"amc:(\d+): '", str(refusal.value)):
         assert int(number[1]) == place + 1
@@ -318,9 +318,9 @@ BVH_FAULTS = {
     "HIERARCHY": ("HIERARCHIE", ":1: no HIERARCHY"),
     "JOINT LeftFoot": ("JOINT LeftFeet", "no joint 'LeftFoot'"),
     "JOINT RightShoulder": ("JOINT Shoulder", "no joint 'RightShoulder'"),
-    "JOINT RightFoot": ("JOINT LeftFoot", r":\d+: joint 'LeftFoot' is there twice"),
+    "JOINT RightFoot": ("JOINT LeftFoot", r":\d+: joint 'LeftFoot' occurs twice"),
     "CHANNELS 3 Zrotation": ("CHANNELS 4 Zrotation", r":\d+: CHANNELS must be their number"),
-    "Frames: 3": ("Frames: 4", "3 of 4 frames are there"),
+    "Frames: 3": ("Frames: 4", "holds 3 of 4 frames"),
     "Frame Time:": ("Frametime:", "'Frame Time:' must follow"),
     "}\nMOTION": ("MOTION", r":\d+: 'MOTION' does not belong here"),
     "\tOFFSET 0 0 0\n": ("", r":\d+: joint '.*' has no OFFSET"),
@@ -330,11 +330,11 @@ BVH_FAULTS = {
 
 @pytest.mark.parametrize("old", BVH_FAULTS)
 def test_a_wrong_bvh_is_refused(tmp_path, old):
-    new, told = BVH_FAULTS[old]
+    new, message = BVH_FAULTS[old]
     text = bvh()[0]
     assert old in text
     (tmp_path / "x.bvh").write_text(text.replace(old, new))
-    with pytest.raises(MocapError, match=told) as refusal:
+    with pytest.raises(MocapError, match=message) as refusal:
         read_bvh(tmp_path / "x.bvh")
     assert "x.bvh" in str(refusal.value)
 
@@ -381,7 +381,7 @@ def test_a_skeleton_is_found_beside_its_motions(archive):
 
 
 @pytest.mark.parametrize(
-    "arrays, told",
+    "arrays, message",
     [
         ({"W": np.zeros(3)}, "no array S_root"),
         ({"S_world": np.zeros((3, 17, 3)), "trial_names": ["a"], "trial_len": [3]}, r"must be numbers \(F,31,3\)"),
@@ -390,9 +390,9 @@ def test_a_skeleton_is_found_beside_its_motions(archive):
         ({"S_world": np.full((3, 31, 3), np.nan), "trial_names": ["a"], "trial_len": [3]}, "NaN"),
     ],
 )
-def test_wrong_arrays_are_refused(tmp_path, arrays, told):
+def test_wrong_arrays_are_refused(tmp_path, arrays, message):
     np.savez(tmp_path / "x.npz", **arrays)
-    with pytest.raises(MocapError, match=told):
+    with pytest.raises(MocapError, match=message):
         read_clips(tmp_path)
 
 
