@@ -80,7 +80,8 @@ def random_cameras(points: np.ndarray, views: ViewSettings, rng: np.random.Gener
     """
     N = len(points)
     middle = points.mean(1)
-    distance = np.exp(rng.uniform(*np.log(views.distance), N))
+    near, far = np.log(views.distance)
+    distance = np.exp(rng.uniform(near, far, N))
     above = rng.uniform(*views.height, N) - (middle[:, 1] - points[..., 1].min(1))
     sine = np.clip(above / distance, -0.9, 0.9)
     aloft = rng.random(N) < views.aloft

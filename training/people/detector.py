@@ -208,7 +208,7 @@ def reported(found: Detections, layouts: np.ndarray, views: ViewSettings) -> Det
         if name == COMPLETE or not len(rows):
             continue
         mapping = human_mapping(name)
-        own = [human_layout().names.index(point) for point in mapping.source.names]
+        own = np.array([human_layout().names.index(point) for point in mapping.source.names])
         mapped = mapping(*(array[np.ix_(rows, own)] for array in (found.xy, found.confidence, found.visible)))
         xy[rows] = np.where(np.isfinite(mapped[0]), mapped[0], xy[rows])
         confidence[rows], visible[rows] = mapped[1], mapped[2]

@@ -124,7 +124,7 @@ def _converted(key: str, value: object, default: object) -> object:
         return tuple(tuple(item) if isinstance(item, list) else item for item in value)
     if isinstance(default, bool) and isinstance(value, bool):
         return value
-    if type(value) in (int, float) and math.isfinite(value):
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
         if type(default) is float:
             return float(value)
         if type(default) is int and value == int(value):
