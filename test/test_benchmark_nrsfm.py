@@ -15,7 +15,7 @@ from paul_ros import cli
 from training import reconstruction
 from training.errors import DataError, TrainingError
 from training.judge import experiments
-from training.judge.experiments import Keeping, Outcome, Run, chosen, perform, summary
+from training.judge.experiments import Experiment, Outcome, SeriesOptions, chosen, perform, summary
 from training.judge.nrsfm import METHODS, find_sequences
 from training.judge.published import NORMALISED_ERROR_PERCENT, published
 from training.judge.truth import Sequence
@@ -168,9 +168,9 @@ def test_a_start_stays_a_start_whatever_is_set_for_others(folder, tmp_path, fake
     paul(folder, tmp_path, "--seeds", "1", "--methods", "paul,linear,rigid", "--sequences", "made", *options)
     found = [(recipe.start, recipe.steps, recipe.bottleneck) for _, recipe, _ in fake.calls]
     assert found == [("random", 100, 3), ("linear", 0, 3), ("rigid", 0, 3)]
-    told = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
-    assert [line.split(":")[0] for line in told] == ["linear", "rigid"]
-    assert all("start=random, regression_steps=0, steps=100 left out" in line for line in told)
+    ignored = [line for line in capsys.readouterr().err.splitlines() if "ignored" in line]
+    assert [line.split(":")[0] for line in ignored] == ["linear", "rigid"]
+    assert all("start=random, regression_steps=0, steps=100 ignored" in line for line in ignored)
 
 
 def test_points_are_hidden_and_the_truth_of_all_judges(folder, tmp_path, fake):
@@ -191,7 +191,7 @@ def test_table_has_the_papers_figures_beside_ours(folder, tmp_path, fake, capsys
     paul(folder, tmp_path, "--seeds", "1", "--plot", str(tmp_path / "b.png"))
     printed = capsys.readouterr()
     assert "PAUL 0.47" in printed.out and "CVPR 2021" in printed.out
-    assert "left out" in printed.err and "unlabelled" in printed.err
+    assert "skipped" in printed.err and "unlabelled" in printed.err
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -204,7 +204,7 @@ def test_published_figures():
 
 
 def outcome(seed, error, loss=0.0):
-    return Outcome(Run(None, "paul", seed), error, error, loss, 1.0, None)
+    return Outcome(Experiment(None, "paul", seed), error, error, loss, 1.0, None)
 
 
 def test_rate_of_bad_basins():
@@ -214,7 +214,7 @@ def test_rate_of_bad_basins():
 
 
 def test_equal_losses_choose_the_first_seed():
-    assert chosen([outcome(1, 5.0), outcome(0, 9.0)]).run.seed == 0
+    assert chosen([outcome(1, 5.0), outcome(0, 9.0)]).experiment.seed == 0
 
 
 @pytest.mark.parametrize(
@@ -251,11 +251,11 @@ def test_the_real_trainer_runs_and_resumes(tmp_path):
     S = truth(0)
     made = Sequence("made", S[:, :2], np.ones((FRAMES, POINTS), bool), S, np.zeros((0, 2), int), False)
     settings = ("start=random", "regression_steps=0", "steps=20", "batch=4", "bottleneck=2", "code_weight=0.01")
-    runs = [Run(made, "paul", 0, settings)]
-    (first,) = perform(runs, Keeping(tmp_path, quiet=True))
+    runs = [Experiment(made, "paul", 0, settings)]
+    (first,) = perform(runs, SeriesOptions(tmp_path, quiet=True))
     assert np.isfinite(first.loss) and first.codes.shape == (FRAMES, 2)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("shapes.npz")}
-    (again,) = perform(runs, Keeping(tmp_path, quiet=True))
+    (again,) = perform(runs, SeriesOptions(tmp_path, quiet=True))
     assert again.ne_flip_global_percent == first.ne_flip_global_percent and len(before) == 1
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("shapes.npz")} == before
 
@@ -280,12 +280,12 @@ def made_runs(*methods, seeds=(0,), settings=()):
     made = Sequence("made", S[:, :2], np.ones((FRAMES, POINTS), bool), S, np.zeros((0, 2), int), False)
     few = ("regression_steps=2", "steps=2", "batch=4", "bottleneck=2")
     own = {"linear": (), "rigid": ()}
-    return [Run(made, method, seed, own.get(method, (*few, *settings))) for seed in seeds for method in methods]
+    return [Experiment(made, method, seed, own.get(method, (*few, *settings))) for seed in seeds for method in methods]
 
 
 def test_runs_that_begin_alike_share_one_start_and_its_seconds(tmp_path, searches):
     runs = made_runs("paul", "adl", "linear", "rigid", seeds=(0, 1))
-    outcomes = perform(runs, Keeping(tmp_path, quiet=True))
+    outcomes = perform(runs, SeriesOptions(tmp_path, quiet=True))
     assert searches == [("linear", FRAMES, 0), ("rigid", FRAMES, 0), ("linear", FRAMES, 1), ("rigid", FRAMES, 1)]
     assert all(100 <= outcome.seconds < 110 for outcome in outcomes)
     starts = [path.read_bytes() for path in sorted(tmp_path.glob("starts/*"))]
@@ -293,50 +293,50 @@ def test_runs_that_begin_alike_share_one_start_and_its_seconds(tmp_path, searche
 
 
 def test_a_shared_start_gives_what_an_own_one_does(tmp_path, searches):
-    perform(made_runs("paul"), Keeping(tmp_path / "shared", quiet=True))
-    (shared,) = perform(made_runs("adl"), Keeping(tmp_path / "shared", quiet=True))
-    (own,) = perform(made_runs("adl"), Keeping(tmp_path / "own", quiet=True))
+    perform(made_runs("paul"), SeriesOptions(tmp_path / "shared", quiet=True))
+    (shared,) = perform(made_runs("adl"), SeriesOptions(tmp_path / "shared", quiet=True))
+    (own,) = perform(made_runs("adl"), SeriesOptions(tmp_path / "own", quiet=True))
     assert len(searches) == 2 and shared.loss == own.loss
     np.testing.assert_array_equal(shared.codes, own.codes)
 
 
 def test_restarts_share_starts_by_their_seeds(tmp_path, searches):
-    perform(made_runs("paul", settings=("restarts=2",)), Keeping(tmp_path, quiet=True))
-    perform(made_runs("adl", seeds=(0, 1, 2)), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paul", settings=("restarts=2",)), SeriesOptions(tmp_path, quiet=True))
+    perform(made_runs("adl", seeds=(0, 1, 2)), SeriesOptions(tmp_path, quiet=True))
     # The order of the frames is the seed's, so that seed 1 of one run has other data than restart 1 of another.
     assert [seed for _, _, seed in searches] == [0, 1, 1, 2]
 
 
 def test_starts_of_other_scale_data_or_version_are_others(tmp_path, searches, monkeypatch):
-    perform(made_runs("paul"), Keeping(tmp_path, quiet=True))
-    perform(made_runs("paul", settings=("scale=free",)), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paul"), SeriesOptions(tmp_path, quiet=True))
+    perform(made_runs("paul", settings=("scale=free",)), SeriesOptions(tmp_path, quiet=True))
     assert len(searches) == 2
     hidden = made_runs("adl")
     hidden[0].sequence.visible[0, 0] = False
-    perform(hidden, Keeping(tmp_path, quiet=True))
+    perform(hidden, SeriesOptions(tmp_path, quiet=True))
     assert len(searches) == 3
     monkeypatch.setattr(experiments, "__version__", "another")
-    perform(made_runs("adl"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("adl"), SeriesOptions(tmp_path, quiet=True))
     assert len(searches) == 4
 
 
 def test_fresh_searches_anew_and_a_damaged_start_says_so(tmp_path, searches):
-    perform(made_runs("paul"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paul"), SeriesOptions(tmp_path, quiet=True))
     (shared,) = tmp_path.glob("starts/*")
     shared.write_bytes(shared.read_bytes()[:100])
     with pytest.raises(TrainingError, match="cannot be read.*--fresh"):
-        perform(made_runs("adl"), Keeping(tmp_path, quiet=True))
-    perform(made_runs("paul", "adl"), Keeping(tmp_path, fresh=True, quiet=True))
+        perform(made_runs("adl"), SeriesOptions(tmp_path, quiet=True))
+    perform(made_runs("paul", "adl"), SeriesOptions(tmp_path, fresh=True, quiet=True))
     assert len(searches) == 2
 
 
 def test_a_run_from_random_weights_has_no_start(tmp_path, searches):
-    perform(made_runs("paper"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paper"), SeriesOptions(tmp_path, quiet=True))
     assert not searches and not (tmp_path / "starts").exists()
 
 
 def test_codes_come_back_in_the_order_of_the_frames(fake, tmp_path):
     S = truth(0)
     made = Sequence("made", S[:, :2], np.ones((FRAMES, POINTS), bool), S, np.zeros((0, 2), int), False)
-    (found,) = experiments.perform([Run(made, "paul", 5)], Keeping(tmp_path, quiet=True))
+    (found,) = experiments.perform([Experiment(made, "paul", 5)], SeriesOptions(tmp_path, quiet=True))
     np.testing.assert_array_equal(found.codes, S[:, 0, :4].astype(np.float32))

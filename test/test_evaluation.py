@@ -15,7 +15,7 @@ from paul_ros import cli, metrics
 from paul_ros.layout import load_layout
 from paul_ros.model import load_model, save_model
 from training.errors import DataError
-from training.judge import evaluation
+from training.judge import evaluation, prediction
 from training.judge.truth import Sequence, load_sequence, random_rotations
 from training.reconstruction import Reconstruction
 
@@ -135,8 +135,8 @@ def test_errors_are_also_those_of_s_cam(model_file, tmp_path):
     visible[:, 9] = False
     data = write(tmp_path / "d.npz", truth, W=truth[:, :2], visible=visible)
     report = evaluate(model_file, data, tmp_path)
-    found = evaluation.predict(load_model(model_file), truth[:, :2], visible).S.astype(float)
-    off = found - evaluation.centred(truth, visible)
+    found = prediction.predict(load_model(model_file), truth[:, :2], visible).S.astype(float)
+    off = found - prediction.centred(truth, visible)
     off[:, :2] *= ~visible[:, None]
     off -= off.mean(2, keepdims=True)
     size = np.linalg.norm(truth - truth.mean(2, keepdims=True), axis=(1, 2))
@@ -322,14 +322,14 @@ def test_random_cameras_see_the_same_shapes():
     np.testing.assert_allclose(metrics.pa_mpjpe(points, true), 0, atol=1e-12)
     unknown = sequence()
     unknown.S[0, 0, 0] = np.nan
-    with pytest.raises(DataError, match="not known"):
+    with pytest.raises(DataError, match="unknown"):
         unknown.from_random_cameras(0)
 
 
 def test_mean_shape_of_one_shape_in_many_poses_is_that_shape():
     shape = np.random.default_rng(0).standard_normal((3, 9))
     R = random_rotations(20, 0)
-    mean = evaluation.rigid_mean(R @ shape * np.linspace(1, 3, 20)[:, None, None], R)
+    mean = prediction.rigid_mean(R @ shape * np.linspace(1, 3, 20)[:, None, None], R)
     assert metrics.pa_mpjpe(mean.T[None], shape.T[None])[0] == pytest.approx(0, abs=1e-12)
     assert np.sqrt((mean**2).sum(0).mean()) == pytest.approx(1)
 

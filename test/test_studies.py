@@ -18,7 +18,7 @@ from training import reconstruction
 from training.categories import joint_layout
 from training.judge.studies import interpolation
 from training.judge.studies.latent import roughness
-from training.judge.studies.study import studies
+from training.judge.studies.registry import STUDIES
 from training.judge.truth import random_rotations
 from training.reconstruction import Reconstruction
 
@@ -113,11 +113,21 @@ def test_latent_spaces_have_two_dimensions_and_both_kinds_of_cameras(files, tmp_
     assert "roughness" in capsys.readouterr().out
 
 
-def test_roughness_tells_a_thread_from_noise():
-    thread = np.stack([np.linspace(0, 1, 500), np.linspace(0, 2, 500)], axis=1)
+def test_roughness_tells_a_curve_from_noise():
+    curve = np.stack([np.linspace(0, 1, 500), np.linspace(0, 2, 500)], axis=1)
     rng = np.random.default_rng(0)
-    assert roughness(thread) == pytest.approx(3 / 499, rel=0.05)
-    assert roughness(rng.permutation(thread)) == pytest.approx(1, abs=0.1)
+    assert roughness(curve) == pytest.approx(3 / 499, rel=0.05)
+    assert roughness(rng.permutation(curve)) == pytest.approx(1, abs=0.1)
+
+
+def test_codes_of_untrained_networks_are_refused_before_any_training(files, tmp_path, fake, capsys):
+    options = ["--seeds", "1", "--set", "steps=0"]
+    study("latent", files, tmp_path, *options, code=1)
+    printed = capsys.readouterr().err
+    assert "study latent needs the codes of trained networks, and method paul trains none" in printed
+    assert printed.count("\n") == 1 and not fake.calls
+    study("bottleneck", files[:1], tmp_path, *options, "--values", "2")
+    assert len(fake.calls) == 1
 
 
 def test_a_study_goes_on_where_it_was(files, tmp_path, fake):
@@ -129,7 +139,7 @@ def test_a_study_goes_on_where_it_was(files, tmp_path, fake):
 
 
 def test_the_benchmark_and_every_study_share_runs(files, tmp_path, fake):
-    """One mechanism: a run is known by what it does, not by who asks for it."""
+    """A run is identified by its data and recipe, whichever command asks for it."""
     study("auto_decoder", files[:1], tmp_path, "--seeds", "1")
     words = ["--data", str(tmp_path), "--sequences", "one", "--methods", "paul", "--seeds", "1", "--quiet"]
     assert cli.main(["benchmark", "nrsfm", *words, "--work", str(tmp_path / "out" / "work")]) == 0
@@ -200,7 +210,8 @@ def test_interpolation_of_a_category_shows_its_own_points(tmp_path, files, far_o
     ]
     for ax in axes:
         points = np.ma.filled(ax.collections[-1].get_offsets(), np.nan)
-        assert np.isfinite(points).all(1).sum() == POINTS and len(ax.lines) == 1
+        bones = ax.collections[0].get_segments()
+        assert np.isfinite(points).all(1).sum() == POINTS and len(bones) == 1 and np.isfinite(bones[0]).all()
 
 
 def test_interpolation_needs_no_truth_and_names_frames_that_do_not_count(tmp_path, model_file, capsys):
@@ -237,7 +248,7 @@ def test_two_files_of_one_name_are_refused(files, tmp_path, fake, capsys):
 
 
 def test_every_study_of_the_command_line_is_there(capsys):
-    assert set(cli._STUDIES) == set(studies())
+    assert set(cli._STUDIES) == set(STUDIES)
     for name in (*cli._STUDIES, "interpolation"):
         with pytest.raises(SystemExit) as end:
             cli.main(["study", name, "--help"])

@@ -393,9 +393,9 @@ def _add_runs(parser: argparse.ArgumentParser, work: Path | None) -> None:
 
 def _keeping(args: argparse.Namespace, work: Path) -> object:
     """How runs are done and kept."""
-    from training.judge.experiments import Keeping
+    from training.judge.experiments import SeriesOptions
 
-    return Keeping(work, args.fresh, args.threads, args.quiet)
+    return SeriesOptions(work, args.fresh, args.threads, args.quiet)
 
 
 def _names(text: str) -> list[str]:
@@ -431,7 +431,7 @@ def _benchmark_nrsfm(args: argparse.Namespace) -> None:
         seeds=args.seeds,
         hide=args.hide,
         settings=args.set,
-        keeping=_keeping(args, args.work),
+        options=_keeping(args, args.work),
     )
     try:
         if args.json:
@@ -607,12 +607,9 @@ def _study(args: argparse.Namespace) -> None:
     need("tqdm", "matplotlib")
     with _training_packages():
         from training.judge.studies import study
+        from training.judge.studies.registry import STUDIES
     keeping = _keeping(args, args.output / "work")
-    print(
-        study.run(
-            study.studies()[args.study], args.data, args.output, args.seeds, tuple(args.values), args.set, keeping
-        )
-    )
+    print(study.run(STUDIES[args.study], args.data, args.output, args.seeds, tuple(args.values), args.set, keeping))
 
 
 def _interpolation(args: argparse.Namespace) -> None:
