@@ -40,7 +40,8 @@ class Bench:
         self.live, self.bag = LiveMake(), BagMake(foreign.DEFINITIONS)
         self.tiny = _tiny_model()
         self.whole_bags = [_tiny_bag(folder / f"{name}.mcap", self.bag, name) for name in ("none", "lz4", "zstd")]
-        self.writers = {name: make() for name, make in PACKED.items()}
+        factories: dict[str, Any] = PACKED
+        self.writers = {name: make() for name, make in factories.items()}
 
     def rewritten(self, message: Any, data: bytes) -> bytes:
         """Read and write a serialised message anew, because the value of padding is arbitrary."""

@@ -109,8 +109,25 @@ def break_types(msg: Any, rng: random.Random) -> None:
 
 
 def _junk(rng: random.Random) -> Any:
-    nested = [[None, [{}]], "x"]
-    plain = (None, "text", b"bytes", 3, -1, 1.5, np.nan, True, 10**400, 1j, [], {}, (), object(), object, nested)
+    nested: list[Any] = [[None, [{}]], "x"]
+    plain: tuple[Any, ...] = (
+        None,
+        "text",
+        b"bytes",
+        3,
+        -1,
+        1.5,
+        np.nan,
+        True,
+        10**400,
+        1j,
+        [],
+        {},
+        (),
+        object(),
+        object,
+        nested,
+    )
     arrays = (np.zeros((2, 3)), np.array(["a"]), np.array(None))
     return rng.choice((*plain, [None] * 17, *arrays, LiveMake()("x/msg/Y")))
 
