@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul benchmark nrsfm`: what reaches the trainer, shuffling, resuming, the choice without truth, table and keys.
+"""`paul benchmark nrsfm`: the trainer's input, shuffling, resuming, the choice without truth, table and keys.
 
 The trainer is a fake that finds each frame's true shape by its image, so that errors are known by construction.
 """
@@ -33,7 +33,7 @@ def truth(seed):
 
 
 class FakeTrainer:
-    """Gives the true shapes, deeper by 1 + ``excess(seed)``; the loss falls with the seed."""
+    """A trainer that returns the true shapes, deeper by 1 + ``excess(seed)``; the loss falls with the seed."""
 
     def __init__(self, shapes):
         self.shapes = {S[:2].astype(np.float32).tobytes(): S for some in shapes for S in some}
@@ -56,7 +56,7 @@ class FakeTrainer:
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two sequences, and a file without truth."""
+    """Write two sequences, and a file without truth."""
     path = tmp_path / "data"
     path.mkdir()
     for seed, name in enumerate(("drink", "made")):
@@ -96,7 +96,7 @@ def test_each_method_trains_its_recipe(folder, tmp_path, fake):
     assert recipes["rigid"].steps == 0 and recipes["rigid"].start == "rigid"
 
 
-def test_frames_are_shuffled_by_the_seed_and_errors_know_it(folder, tmp_path, fake):
+def test_frames_are_shuffled_by_the_seed_and_put_back_for_errors(folder, tmp_path, fake):
     report = paul(folder, tmp_path, "--seeds", "2", "--sequences", "made", "--methods", "paul")
     given = [data.W for data, _, _ in fake.calls]
     W = truth(1)[:, :2].astype(np.float32)
@@ -108,7 +108,7 @@ def test_frames_are_shuffled_by_the_seed_and_errors_know_it(folder, tmp_path, fa
 
 
 def test_errors_and_the_chosen_seed(folder, tmp_path, fake):
-    """Lowest loss is the last seed's, lowest error the first one's: the choice must not look at errors."""
+    """The last seed has the lowest loss and the first the lowest error; the choice must ignore errors."""
     fake.excess = lambda seed: 0.1 * (1 + seed)
     report = paul(folder, tmp_path, "--seeds", "3", "--sequences", "drink", "--methods", "paul")
     S = truth(0)
@@ -124,7 +124,7 @@ def test_errors_and_the_chosen_seed(folder, tmp_path, fake):
 
 
 def test_no_ground_truth_reaches_the_trainer(folder, tmp_path, fake):
-    """Neither in what it is given nor in any file of its folder; and its data does not change with the truth."""
+    """The trainer's arguments and files hold no truth, and do not change with it."""
     paul(folder, tmp_path, "--seeds", "1", "--sequences", "made", "--methods", "paul")
     data, _, run = fake.calls[0]
     assert {name for name, value in vars(data).items() if isinstance(value, np.ndarray)} == {"W", "visible", "used"}
@@ -162,7 +162,7 @@ def test_another_setting_is_another_run(folder, tmp_path, fake):
     assert len(fake.calls) == 3
 
 
-def test_a_start_stays_a_start_whatever_is_set_for_others(folder, tmp_path, fake, capsys):
+def test_settings_of_training_do_not_apply_to_start_methods(folder, tmp_path, fake, capsys):
     settings = ("start=random", "regression_steps=0", "steps=100", "bottleneck=3")
     options = [word for setting in settings for word in ("--set", setting)]
     paul(folder, tmp_path, "--seeds", "1", "--methods", "paul,linear,rigid", "--sequences", "made", *options)
@@ -196,7 +196,7 @@ def test_table_has_the_papers_figures_beside_ours(folder, tmp_path, fake, capsys
 
 
 def test_published_figures():
-    """Some of each row of the paper's table."""
+    """Some figures of each row equal the paper's."""
     assert published("drink") == published("drink_train") == NORMALISED_ERROR_PERCENT["drink"]
     assert published("shark")["PAUL"] == 0.37 and published("S5_train")["Deep NRSfM"] == 13.40
     assert published("pickup")["BMM-v2"] == 1.98 and published("s123")["CNS"] == 26.46
@@ -228,7 +228,7 @@ def test_equal_losses_choose_the_first_seed():
         (["--hide", "0.9"], "too few points"),
     ],
 )
-def test_what_is_wrong_is_one_line_before_any_training(folder, tmp_path, fake, capsys, options, message):
+def test_errors_are_one_line_before_any_training(folder, tmp_path, fake, capsys, options, message):
     paul(folder, tmp_path, *options, code=1)
     printed = capsys.readouterr().err
     assert message in printed.splitlines()[-1] and "Traceback" not in printed
@@ -262,7 +262,7 @@ def test_the_real_trainer_runs_and_resumes(tmp_path):
 
 @pytest.fixture
 def searches(monkeypatch):
-    """What starts were searched for; a start is random shapes of its seed, and takes 100 s."""
+    """Record the searches for starts; each gives random shapes of its seed and takes 100 s."""
     found = []
 
     def search(kind, W, visible, seed, progress):
@@ -283,7 +283,7 @@ def made_runs(*methods, seeds=(0,), settings=()):
     return [Experiment(made, method, seed, own.get(method, (*few, *settings))) for seed in seeds for method in methods]
 
 
-def test_runs_that_begin_alike_share_one_start_and_its_seconds(tmp_path, searches):
+def test_experiments_with_equal_starts_share_one_and_its_seconds(tmp_path, searches):
     runs = made_runs("paul", "adl", "linear", "rigid", seeds=(0, 1))
     outcomes = perform(runs, SeriesOptions(tmp_path, quiet=True))
     assert searches == [("linear", FRAMES, 0), ("rigid", FRAMES, 0), ("linear", FRAMES, 1), ("rigid", FRAMES, 1)]
@@ -292,7 +292,7 @@ def test_runs_that_begin_alike_share_one_start_and_its_seconds(tmp_path, searche
     assert len(starts) == 4 and {path.read_bytes() for path in tmp_path.glob("made*/run/start.npz")} == set(starts)
 
 
-def test_a_shared_start_gives_what_an_own_one_does(tmp_path, searches):
+def test_a_shared_start_gives_the_same_as_an_own_one(tmp_path, searches):
     perform(made_runs("paul"), SeriesOptions(tmp_path / "shared", quiet=True))
     (shared,) = perform(made_runs("adl"), SeriesOptions(tmp_path / "shared", quiet=True))
     (own,) = perform(made_runs("adl"), SeriesOptions(tmp_path / "own", quiet=True))
@@ -303,11 +303,11 @@ def test_a_shared_start_gives_what_an_own_one_does(tmp_path, searches):
 def test_restarts_share_starts_by_their_seeds(tmp_path, searches):
     perform(made_runs("paul", settings=("restarts=2",)), SeriesOptions(tmp_path, quiet=True))
     perform(made_runs("adl", seeds=(0, 1, 2)), SeriesOptions(tmp_path, quiet=True))
-    # The order of the frames is the seed's, so that seed 1 of one run has other data than restart 1 of another.
+    # Seed 1 of one run has another order of frames, and so other data, than restart 1 of another run.
     assert [seed for _, _, seed in searches] == [0, 1, 1, 2]
 
 
-def test_starts_of_other_scale_data_or_version_are_others(tmp_path, searches, monkeypatch):
+def test_other_scales_data_or_versions_have_other_starts(tmp_path, searches, monkeypatch):
     perform(made_runs("paul"), SeriesOptions(tmp_path, quiet=True))
     perform(made_runs("paul", settings=("scale=free",)), SeriesOptions(tmp_path, quiet=True))
     assert len(searches) == 2

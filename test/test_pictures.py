@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the benchmark and of studies: what is drawn where, from made-up outcomes."""
+"""Pictures of the benchmark and of studies, drawn from artificial outcomes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,13 @@ FRAMES = 30
 
 
 def outcomes(experiments, error, ratio=1.0):
-    """Errors with one flip for all are larger by that ratio; codes lie on the right half of a ring about (5, 5)."""
+    """Return outcomes with codes on the right half of a ring about (5, 5).
+
+    Args:
+        experiments: of the outcomes.
+        error: gives the error of an experiment, flip per frame.
+        ratio: of the error with one flip for all to that one.
+    """
     angle = np.linspace(-np.pi / 2, np.pi / 2, FRAMES)
     codes = 5 + np.stack([np.cos(angle), np.sin(angle)], 1)
     return [Outcome(one, error(one), ratio * error(one), one.seed, 1.0, codes) for one in experiments]

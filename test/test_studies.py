@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul study`: what is varied, what is reported, resuming, and pictures that are there."""
+"""`paul study`: varied quantities, reports, resuming, pictures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FRAMES, POINTS = 12, 14
 
 
 class FakeTrainer:
-    """Flat shapes; the depth that is missing is the error. Keeps what it was given."""
+    """A trainer that returns flat shapes, so that the missing depth is the error; it records its calls."""
 
     def __init__(self):
         self.calls = []
@@ -130,7 +130,7 @@ def test_codes_of_untrained_networks_are_refused_before_any_training(files, tmp_
     assert len(fake.calls) == 1
 
 
-def test_a_study_goes_on_where_it_was(files, tmp_path, fake):
+def test_an_interrupted_study_continues(files, tmp_path, fake):
     study("bottleneck", files[:1], tmp_path, "--seeds", "1", "--values", "2,3")
     report = study("bottleneck", files[:1], tmp_path, "--seeds", "2", "--values", "2,3,4")
     assert len(fake.calls) == 6 == len(report["rows"])
@@ -167,7 +167,7 @@ def test_interpolation_draws_the_line_between_two_codes(model_file, tmp_path, ca
 
 
 def random_model(path, layout):
-    """A model file of random weights."""
+    """Write a model of random weights."""
     header = {
         "layout": layout.to_dict(),
         "bottleneck": 2,
@@ -187,7 +187,7 @@ def random_model(path, layout):
 
 @pytest.mark.parametrize("far_off", [0.0, 9.0])
 def test_interpolation_of_a_category_shows_its_own_points(tmp_path, files, far_off, monkeypatch):
-    """What the model has for points of the other category counts for nothing, and is not drawn."""
+    """The model's points of the other category count for nothing and are not drawn."""
     drawn = []
     monkeypatch.setattr(interpolation, "save_figure", lambda figure, path: drawn.append(figure))
     layout = joint_layout(["one", "other"], [anonymous_layout(POINTS, ((0, 1),)), anonymous_layout(5)])
@@ -214,7 +214,7 @@ def test_interpolation_of_a_category_shows_its_own_points(tmp_path, files, far_o
         assert np.isfinite(points).all(1).sum() == POINTS and len(bones) == 1 and np.isfinite(bones[0]).all()
 
 
-def test_interpolation_needs_no_truth_and_names_frames_that_do_not_count(tmp_path, model_file, capsys):
+def test_interpolation_needs_no_truth_and_names_frames_that_are_not_counted(tmp_path, model_file, capsys):
     S = np.random.default_rng(0).standard_normal((4, 3, 17))
     visible = np.ones((4, 17), bool)
     visible[1, 2:] = False
@@ -232,7 +232,7 @@ def test_interpolation_needs_no_torch(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_frames_that_are_not_there_are_named(files, tmp_path, model_file, capsys):
+def test_missing_frames_are_named(files, tmp_path, model_file, capsys):
     S = np.random.default_rng(0).standard_normal((3, 3, 17))
     np.savez(tmp_path / "seen.npz", W=S[:, :2], S=S)
     options = "--model", str(model_file), "--frames", "1,3"
