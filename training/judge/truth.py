@@ -35,7 +35,7 @@ class Sequence:
 
     @property
     def present(self) -> np.ndarray:
-        """Whether the truth of each point is known, (F,P) bool."""
+        """Mask (F,P) of the points with a known truth."""
         return np.isfinite(self.S).all(1)
 
     def hiding(self, share: float, seed: int) -> Sequence:
