@@ -1,13 +1,16 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The error of a run against its time, and beside it that of a run which starts from the true 3D: what is left to gain.
+"""Error over training time of two runs: one starts from 2D alone, the other from the true 3D.
 
     python benchmarks/curve.py S5_train.npz --unseen S5_test.npz [--recipe lifting] [--seed 0] -o out/curve_S5
 
-Both runs have one recipe and so one length; where the second one is better, it is the search that is missing, and where
-it is not, capacity, time or the objective.  DATA and the unseen file hold W (F,2,P) and the truth S (F,3,P), which
-nothing but the judge and the second run's start looks at.  Writes curve.json and curve.png; stopped, the same command
-goes on.  Errors are NE % with visible points where they were seen (S_cam), and for unseen frames also as predicted.
+Both runs have the same recipe and length.  If the run from the true 3D is better, the search for a start is the limit.
+If it is not, the limit is capacity, time or the objective.
+
+DATA and the unseen file hold W (F,2,P) and the truth S (F,3,P).  Only the evaluation and the second run's start use S.
+The folder receives curve.json and curve.png.  The same command continues an interrupted measurement.
+
+Errors are NE in % with visible points at their observed x and y (S_cam); for unseen frames also as predicted.
 """
 
 from __future__ import annotations
@@ -15,10 +18,12 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from paul_ros.errors import PaulError
 from paul_ros.files import write_atomically
 from paul_ros.metrics import normalised_error_of_signs
 from training.data import load_training_data
@@ -32,18 +37,24 @@ from training.trainer import Trainer
 
 JUDGED = 3000  # frames, evenly chosen
 STARTS = {"2D": "from 2D alone", "truth": "from the true 3D"}
+Row = dict[str, Any]
+"""Step, seconds, and the errors of training and of unseen frames."""
 
 
 def true_start(S: np.ndarray, unit: float) -> Start:
-    """What a perfect search would give for truth S (F,3,P) in the camera frame, in units of the image."""
-    S = torch.from_numpy(S - S.mean(2, keepdims=True)).double() / unit
-    shapes, turn = aligned(S)
+    """Return the start that a perfect search would find.
+
+    Args:
+        S: (F,3,P) truth in the camera frame, image units.
+        unit: image units per unit of the networks.
+    """
+    shapes, turn = aligned(torch.from_numpy(S - S.mean(2, keepdims=True)).double() / unit)
     return Start(np.arange(len(S)), shapes.float().numpy(), turn.mT.float().numpy(), 0.0, 0.0)
 
 
 @torch.no_grad()
 def errors(trainer: Trainer, truth: Sequence) -> dict[str, float]:
-    """NE % of evenly chosen frames, lifted one by one."""
+    """Return the NE in % of evenly chosen frames, each lifted alone."""
     rows = np.linspace(0, len(truth.W) - 1, min(JUDGED, len(truth.W))).astype(int)
     W, visible = torch.from_numpy(truth.W[rows]).float(), torch.from_numpy(truth.visible[rows])
     unit = trainer.data.image_unit if trainer.recipe.scale == "unit" else None
@@ -61,8 +72,20 @@ def errors(trainer: Trainer, truth: Sequence) -> dict[str, float]:
     }
 
 
-def curve(data_file: Path, unseen_file: Path, recipe: Recipe, kind: str, every: int, folder: Path) -> list[dict]:
-    """Train and judge in turns; a row each time."""
+def curve(data_file: Path, unseen_file: Path, recipe: Recipe, kind: str, every: int, folder: Path) -> list[Row]:
+    """Train and judge in turns.
+
+    Args:
+        data_file: frames to train on, with their truth.
+        unseen_file: other frames with their truth.
+        recipe: of the training.
+        kind: start, a key of ``STARTS``.
+        every: steps between evaluations.
+        folder: that keeps the run.
+
+    Returns:
+        A row each time.
+    """
     data, kept = load_training_data(data_file), folder / "rows.json"
     train, unseen = load_sequence(data_file), load_sequence(unseen_file)
     if kind == "truth":
@@ -82,8 +105,8 @@ def curve(data_file: Path, unseen_file: Path, recipe: Recipe, kind: str, every: 
     return rows
 
 
-def line(row: dict) -> str:
-    """A row for people."""
+def line(row: Row) -> str:
+    """Format a row."""
     train, unseen = row["train"], row["unseen"]
     return (
         f"step {row['step']:6d} {row['seconds'] / 60:6.1f} min  train {train['observed_flip_frame']:6.2f} / "
@@ -93,8 +116,8 @@ def line(row: dict) -> str:
     )
 
 
-def draw(curves: dict[str, list[dict]], path: Path) -> None:
-    """Training frames at the left, unseen ones at the right; one flip for all is dashed."""
+def draw(curves: dict[str, list[Row]], path: Path) -> None:
+    """Draw training frames at the left and unseen ones at the right; one flip for all is dashed."""
     figure = new_figure(11, 4.5)
     for ax, part in zip(figure.subplots(1, 2, sharey=True), ("train", "unseen")):
         for colour, (kind, rows) in zip(COLOURS, curves.items()):
@@ -112,17 +135,17 @@ def draw(curves: dict[str, list[dict]], path: Path) -> None:
 
 
 def main() -> None:
-    """Both curves, as lines, JSON and a picture."""
+    """Measure both curves, and write them as lines, JSON and a picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--unseen", type=Path, required=True)
-    parser.add_argument("--recipe", default="lifting")
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="a setting of the recipe")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--starts", nargs="+", choices=list(STARTS), default=list(STARTS))
-    parser.add_argument("--every", type=int, default=1000, help="steps between judgements")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder")
+    parser.add_argument("data", metavar="DATA", type=Path, help="frames to train on (.npz)")
+    parser.add_argument("--unseen", metavar="FILE", type=Path, required=True, help="frames to judge by (.npz)")
+    parser.add_argument("--recipe", default="lifting", help="name or YAML file (default: %(default)s)")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="override a recipe setting")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the training (default: %(default)s)")
+    parser.add_argument("--starts", nargs="+", choices=list(STARTS), default=list(STARTS), help="runs (default: both)")
+    parser.add_argument("--every", type=int, default=1000, help="steps between evaluations (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="folder of the results")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     recipe = Recipe.load(args.recipe, [*args.set, f"seed={args.seed}"])
@@ -132,4 +155,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except PaulError as error:
+        raise SystemExit(f"curve: {error}") from None

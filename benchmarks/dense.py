@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Peak memory and time of training on thousands of points: a made-up articulated mesh, ``paul train`` as it is.
+"""Peak memory and time of ``paul train`` on thousands of points of a synthetic articulated mesh.
 
     python benchmarks/dense.py [--points 6890] [--frames 5000] [--epochs 3] [--set KEY=VALUE ...]
 
-Memory is that of the whole command, from reading the file to writing the model and the shapes of all frames: the
-largest resident set of the process, as the kernel counts it.  An epoch is as many steps as show each frame once on
-average; beside its time by the clock stands the processor time of the whole command, for machines with other work.
+Memory is the largest resident set of the whole command, as the kernel counts it: from reading the file to writing the
+model and the shapes of all frames.  An epoch has as many steps as show each frame once on average.  The processor time
+of the whole command is printed too, for machines with other work.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from pathlib import Path
 
 
 def run(*arguments: object) -> resource.struct_rusage:
-    """Run a Python module in a process of its own; returns what it used."""
+    """Run a Python module in a process of its own, and return its use of resources."""
     child = subprocess.Popen([sys.executable, "-m", *map(str, arguments)])
     _, status, usage = os.wait4(child.pid, 0)
     if status:
-        raise SystemExit(f"{arguments[0]} failed")
+        raise SystemExit(f"python -m {arguments[0]} failed; see its error above")
     return usage
 
 
 def main() -> None:
-    """Make the mesh, train, print a line."""
+    """Make the mesh, train on it, and print a line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, default=6890)
-    parser.add_argument("--frames", type=int, default=5000)
-    parser.add_argument("--epochs", type=int, default=3)
-    parser.add_argument("--batch", type=int, default=128)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="a setting of the recipe")
+    parser.add_argument("--points", type=int, default=6890, help="points of the mesh (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=5000, help="frames (default: %(default)s)")
+    parser.add_argument("--epochs", type=int, default=3, help="epochs to train (default: %(default)s)")
+    parser.add_argument("--batch", type=int, default=128, help="frames a step (default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="override a recipe setting")
     args = parser.parse_args()
     steps = -(-args.epochs * args.frames // args.batch)
     settings = [f"steps={steps}", f"batch={args.batch}", *args.set]

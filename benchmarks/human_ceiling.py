@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""What the human recipe's networks reach with 3D labels: the ceiling of its training from 2D alone.
+"""Train the human recipe with 3D labels: the upper bound of its training from 2D alone.
 
     python benchmarks/human_ceiling.py CMU_FOLDER -o out/ceiling [--set KEY=VALUE ...]
 
-The same views, networks, length and losses as ``paul train CMU_FOLDER --recipe human``, but the shapes that are learned
-are the true ones from the first step to the last.  Writes ceiling.npz, for ``benchmarks/human_model.py``.
+Views, networks, length and losses are those of ``paul train CMU_FOLDER --recipe human``, but the networks learn the
+true shapes from the first step to the last.  The folder receives ceiling.npz, for ``benchmarks/human_model.py``.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from paul_ros.errors import PaulError
 from training.data import load_training_data
 from training.export import export_model
 from training.judge.truth import load_sequence
-from training.people.human_data import make_file
-from training.people.mocap import human_layout
+from training.people.human_data import make_file, views_of
+from training.people.human_points import human_layout
 from training.recipe import Recipe
 from training.reconstruction import final_loss
 from training.start.kept_start import START_UNIT, Start, kept_start, start_identity
@@ -31,7 +32,7 @@ from training.trainer import Trainer
 
 
 def labels(trainer: Trainer, S: np.ndarray) -> Start:
-    """The true shapes S (F,3,P) of all frames, camera frame, as a perfect search would give them."""
+    """Return the start that a perfect search would find: the true shapes S (F,3,P) of all frames, camera frame."""
     views = trainer.views(torch.arange(len(S)))
     X = torch.from_numpy(S - S.mean(2, keepdims=True)).float()
     W = views.W / START_UNIT["free"]
@@ -41,23 +42,24 @@ def labels(trainer: Trainer, S: np.ndarray) -> Start:
 
 
 def main() -> None:
-    """Train and export."""
+    """Train and export the model."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="motion capture, as training/README.md says")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder")
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="a setting of the recipe")
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("folder", metavar="CMU_FOLDER", type=Path, help="folder of motion capture")
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path, required=True, help="folder of the results")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="override a recipe setting")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     recipe, run = Recipe.load("human", args.set), args.output / "run"
-    make_file(args.folder, recipe.views, args.output / "2d.npz", args.output / "3d.npz")
+    make_file(args.folder, views_of(recipe), args.output / "2d.npz", args.output / "3d.npz")
     steps = recipe.regression_steps + recipe.steps
-    recipe = replace(recipe, views=None, regression_steps=steps - 1, steps=1)  # without any there would be no networks
+    # All steps regress the labels, but for the one without which a recipe trains no networks.
+    recipe = replace(recipe, views=None, regression_steps=steps - 1, steps=1)
     data = load_training_data(args.output / "2d.npz", human_layout())
     trainer = Trainer(data, recipe, run)
     S = load_sequence(args.output / "3d.npz").S
     if len(S) != len(data.W):
-        raise SystemExit("some frames were left out, so labels are of others: report this")
+        raise SystemExit("the trainer left frames out, so labels belong to other frames: report this as a bug")
     kept_start(run, start_identity(data, recipe), lambda: labels(trainer, S), torch.device("cpu"))
     trainer.resume()
     with tqdm(total=trainer.steps, initial=trainer.step, desc="with 3D labels") as bar:
@@ -68,4 +70,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except PaulError as error:
+        raise SystemExit(f"human_ceiling: {error}") from None

@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Human models on motion capture that none of them was trained on, seen as robots see people: the model card's figures.
+"""Errors of human models on held-out motion capture, seen as robots see people: the figures of the model card.
 
     python benchmarks/human_model.py CMU_FOLDER [--models human,other.npz] [--json F] [--plot F.png] [--trials]
 
-Frames of the held-out trials, evenly chosen from each, every one from a camera of its own
-(training/people/view_settings.py, but whole in the image and of the captured people's own proportions), lifted one by
-one with the camera's intrinsics.
-What differs from row to row is the detector's layout, the level of its errors (1: the measured noise profile), the
-share of points that it misses and the distance.  Errors are over all points of the detector's layout that the model
-has, hidden ones too, and over the 12 joints of the limbs that all layouts have; of the root's position the median is
-told.
+Frames are chosen evenly from each held-out trial.  Each has a camera of its own, as in the training views
+(training/people/view_settings.py), but bodies lie whole in the image and keep the captured people's proportions.
+Frames are lifted alone, with the camera's intrinsics.
+
+Rows differ in the detector's layout, the level of its errors (1: the measured noise profile), the share of points that
+it misses, and the distance.  Errors are means over all points of the detector's layout that the model has, hidden ones
+included, and over the 12 joints of the limbs that all layouts have.  Errors of the root's position are medians.
 """
 
 from __future__ import annotations
@@ -19,25 +19,30 @@ import argparse
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from msg_adapters import Intrinsics
 from paul_ros import metrics
+from paul_ros.errors import PaulError
 from paul_ros.files import write_atomically
 from paul_ros.layout import load_layout
 from paul_ros.lifted import Lifted
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import DEFAULT_MODEL, load_model
 from training.judge.pictures import COLOURS, new_figure, save_figure, titled
-from training.people.human_data import HELD_OUT, Seen, read_clips, see
-from training.people.mocap import human_layout, human_points
+from training.people.clips import read_clips
+from training.people.human_data import views_of
+from training.people.human_points import human_layout, human_points
+from training.people.poses import HELD_OUT
+from training.people.simulated_views import SimulatedViews, simulate_views
 from training.recipe import Recipe
 
 LAYOUTS = ("coco17", "body25", "openpose18", "h36m17", "mediapipe33")
 FOCAL = 1000.0
-"""Pixels: every view is brought to one focal length, as the lifter takes a camera for all persons of a call."""
+"""Focal length that all views are brought to, pixels, because the lifter takes one camera a call."""
 
 LIMBS = [
     f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")
@@ -46,7 +51,14 @@ LIMBS = [
 
 @dataclass(frozen=True)
 class Condition:
-    """One row: a detector's layout, its level of errors, the share of points missed, distances in metres."""
+    """The condition of one row.
+
+    Attributes:
+        layout: of the detector.
+        level: of its errors.
+        hidden: share of points that it misses.
+        distance: least and greatest distance, metres.
+    """
 
     layout: str = "coco17"
     level: float = 0.0
@@ -70,10 +82,10 @@ CONDITIONS = (
 )
 
 
-def seen_as(points: np.ndarray, condition: Condition, seed: int = 0) -> Seen:
-    """Views of bodies (N,43,3) under a condition."""
+def views_under(points: np.ndarray, condition: Condition, seed: int = 0) -> SimulatedViews:
+    """Simulate views of bodies (N,43,3) under a condition."""
     views = replace(
-        Recipe.load("human").views,
+        views_of(Recipe.load("human")),
         layouts=((condition.layout, 1.0),),
         level=(condition.level,) * 2,
         hidden=(condition.hidden,) * 2,
@@ -82,11 +94,11 @@ def seen_as(points: np.ndarray, condition: Condition, seed: int = 0) -> Seen:
         occlusion=False,
         obstacle=0.0,
     )
-    return see(points, views, np.random.default_rng(seed))
+    return simulate_views(points, views, np.random.default_rng(seed))
 
 
-def lift(lifter: Lifter, seen: Seen) -> tuple[Lifted, Seen]:
-    """The persons that were lifted, and what was seen of them."""
+def lift(lifter: Lifter, seen: SimulatedViews) -> tuple[Lifted, SimulatedViews]:
+    """Lift the bodies; returns the persons that were lifted, and their views."""
     model = lifter.model.layout
     to_model = human_layout().map_to(model)
     rays = seen.cameras.rays(seen.xy)
@@ -97,8 +109,8 @@ def lift(lifter: Lifter, seen: Seen) -> tuple[Lifted, Seen]:
     return replace(lifted, **arrays), replace(seen, points=seen.points[ok])
 
 
-def figures(lifter: Lifter, seen: Seen, layout: str) -> dict[str, float]:
-    """The errors of one row."""
+def figures(lifter: Lifter, seen: SimulatedViews, layout: str) -> dict[str, float]:
+    """Return the errors of one row."""
     lifted, shown = lift(lifter, seen)
     names = lifter.model.layout.names
     some = [name for name in load_layout(layout).names if name in names]
@@ -126,16 +138,25 @@ def figures(lifter: Lifter, seen: Seen, layout: str) -> dict[str, float]:
 
 
 def held_out(folder: Path, frames: int) -> dict[str, np.ndarray]:
-    """Bodies (n,43,3) of evenly chosen frames of every trial that is kept for judging."""
+    """Return bodies (n,43,3) of evenly chosen frames of every held-out trial, by its name."""
     clips = {name: joints for name, joints in read_clips(folder) if name.startswith(HELD_OUT)}
     if not clips:
-        raise SystemExit(f"'{folder}' holds none of the trials that are kept for judging: {', '.join(HELD_OUT)}")
+        raise SystemExit(f"'{folder}' holds none of the held-out trials; add some of {', '.join(HELD_OUT)}")
     chosen = {name: np.unique(np.linspace(0, len(clip) - 1, frames).astype(int)) for name, clip in clips.items()}
     return {name: human_points(clips[name][rows]) for name, rows in sorted(chosen.items())}
 
 
-def measure(models: list[str], trials: dict[str, np.ndarray], each: bool) -> list[dict]:
-    """A row for every model and condition; with `each`, for every model and trial too, COCO-17 and true 2D."""
+def measure(models: list[str], trials: dict[str, np.ndarray], each: bool) -> list[dict[str, Any]]:
+    """Measure every model under every condition.
+
+    Args:
+        models: names or files.
+        trials: bodies (n,43,3) by the trial's name.
+        each: whether to add a row for every trial, with COCO-17 and true 2D.
+
+    Returns:
+        A row for every model and condition, and for the rigid mean shape of the first model.
+    """
     everybody = np.concatenate(list(trials.values()))
     cases = [(str(condition), everybody, condition) for condition in CONDITIONS]
     cases += [(name, np.repeat(points, 2, axis=0), Condition()) for name, points in trials.items() if each]
@@ -143,15 +164,15 @@ def measure(models: list[str], trials: dict[str, np.ndarray], each: bool) -> lis
     lifters["rigid mean shape"] = Lifter(next(iter(lifters.values())).model.rigid())
     rows = []
     for what, points, condition in tqdm(cases, desc="conditions", leave=False):
-        seen = seen_as(points, condition)
+        seen = views_under(points, condition)
         rows += [
             {"model": name, "what": what, **figures(lifter, seen, condition.layout)} for name, lifter in lifters.items()
         ]
     return rows
 
 
-def table(rows: list[dict]) -> str:
-    """Markdown."""
+def table(rows: list[dict[str, Any]]) -> str:
+    """Format the rows as a Markdown table."""
     models = list(dict.fromkeys(row["model"] for row in rows))
     heads = [f"{model}: PA-MPJPE (of the limbs), N-MPJPE mm, root mm (%)" for model in models]
     lines = ["| | " + " | ".join(heads) + " |", "|---" * (len(models) + 1) + "|"]
@@ -167,8 +188,8 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def draw(rows: list[dict], path: Path) -> None:
-    """PA-MPJPE of every model under every condition."""
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw the PA-MPJPE of every model under every condition."""
     models = list(dict.fromkeys(row["model"] for row in rows))
     conditions = [str(condition) for condition in CONDITIONS]
     figure = new_figure(9, 0.36 * len(conditions) + 1)
@@ -186,13 +207,13 @@ def draw(rows: list[dict], path: Path) -> None:
 
 
 def main() -> None:
-    """Prints the table."""
+    """Measure the models and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="motion capture, as training/README.md says")
+    parser.add_argument("folder", metavar="CMU_FOLDER", type=Path, help="folder of motion capture")
     parser.add_argument("--models", default=DEFAULT_MODEL, metavar="A,B", help="names or files (default: %(default)s)")
-    parser.add_argument("--frames", type=int, default=150, help="of each trial (default: %(default)s)")
-    parser.add_argument("--trials", action="store_true", help="a row for every trial too")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows")
+    parser.add_argument("--frames", type=int, default=150, help="frames a trial (default: %(default)s)")
+    parser.add_argument("--trials", action="store_true", help="add a row for every trial")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows as JSON")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the conditions")
     args = parser.parse_args()
     rows = measure(args.models.split(","), held_out(args.folder, args.frames), args.trials)
@@ -204,4 +225,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except PaulError as error:
+        raise SystemExit(f"human_model: {error}") from None

@@ -1,16 +1,18 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Frames per second of the trainer, beside the same model written down plainly in eager torch with an SVD.
+"""Frames per second of the trainer and of a plain twin: the same model in eager torch with an SVD.
 
     python benchmarks/trainer_speed.py [--rounds 30] [--threads 1] [--json FILE]
 
-The twin is what one writes from the paper: the same networks, batches, losses and Adam, layer by layer, the camera by
-least squares and torch.linalg.svd with its gradients (section 4.2), nothing fused or batched by hand. The trainer is
-``training.trainer.Trainer`` as it is. With ``solver: algebraic`` it computes what the twin does; its exact cameras, the
-default, are more work than the twin's. So is what the twin leaves out: learning rates that change, hidden points, terms
-and seconds for the log, and a step that Ctrl-C cannot break. Both take turns in rounds of ten steps, so that they see
-the same machine; the ratio is the median of the rounds'. Views: shapes of the shipped human model (17 points) from
-random sides, all of one scale.
+The twin is a direct implementation of the paper: the same networks, batches, losses and Adam, layer by layer.  Its
+cameras come from least squares and torch.linalg.svd with gradients (section 4.2); nothing is fused or batched by hand.
+
+The trainer is ``training.trainer.Trainer``.  With ``solver: algebraic`` it computes the same as the twin.  Its exact
+cameras, the default, are more work.  It also does work that the twin omits: learning rates that change, hidden points,
+terms and seconds for the log, and steps that Ctrl-C cannot break.
+
+Both take turns in rounds of ten steps, so that load of the machine affects both alike.  The ratio is the median over
+rounds.  Views are shapes of the shipped human model from random sides, all of one scale.
 """
 
 from __future__ import annotations
@@ -20,8 +22,9 @@ import itertools
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -36,14 +39,14 @@ from training.networks import build_networks
 from training.recipe import Recipe
 from training.trainer import Trainer
 
-STEPS = 10  # of each in a round
+STEPS = 10  # steps of each in a round
 FRAMES = 4000
 MODES = {"free codes": "free", "2D encoder": "encoder"}
 SOLVERS = ("exact", "algebraic")
 
 
 def views() -> TrainingData:
-    """Image points of FRAMES frames, all visible."""
+    """Return the image points of FRAMES frames, all visible."""
     rng, model = np.random.default_rng(0), load_model()
     S = random_rotations(FRAMES, 0) @ model.decode(0.3 * rng.standard_normal((FRAMES, model.header["bottleneck"])))
     visible = np.ones((FRAMES, S.shape[2]), bool)
@@ -53,7 +56,7 @@ def views() -> TrainingData:
 
 
 class Twin:
-    """The paper's method as one would write it down, for views of one scale of which every point is seen."""
+    """Plain implementation of the paper's method, for views of one scale without hidden points."""
 
     def __init__(self, data: TrainingData, recipe: Recipe) -> None:
         torch.manual_seed(recipe.seed)
@@ -67,7 +70,7 @@ class Twin:
         self.adam = torch.optim.Adam(used, lr=recipe.learning_rate)
 
     def step(self) -> float:
-        """One step; returns its loss."""
+        """Do one step, and return its loss."""
         loss = self.loss(torch.randint(len(self.W), (self.recipe.batch,)))
         self.adam.zero_grad()
         loss.backward()
@@ -76,7 +79,7 @@ class Twin:
         return loss.item()
 
     def loss(self, rows: Tensor) -> Tensor:
-        """The paper's equation 7 of some frames (N,)."""
+        """Return the paper's equation 7 of some frames (N,)."""
         W = self.W[rows]
         code = self.code(rows)
         ad = self.decode(code)
@@ -91,23 +94,24 @@ class Twin:
         return loss
 
     def code(self, rows: Tensor) -> Tensor:
-        """Codes (N,K), free or by the residual encoder."""
+        """Return codes (N,K), free ones or those of the residual encoder."""
         if self.recipe.codes == "free":
-            return self.networks.free_codes(rows)
-        encoder = self.networks.encoder
+            free_codes = cast(nn.Embedding, self.networks.free_codes)
+            return free_codes(rows)
+        encoder: Any = self.networks.encoder
         x = F.relu(encoder.input(torch.cat([self.W[rows].flatten(1), self.visible[rows].float()], dim=1)))
         for block in encoder.blocks:
             x = x + F.relu(block.second(F.relu(block.first(x))))
         return encoder.output(x)
 
     def decode(self, code: Tensor) -> Tensor:
-        """Shapes (N,3,P), centred."""
+        """Return centred shapes (N,3,P)."""
         S = self.layers(self.networks.decoder, code).unflatten(1, (3, -1))
         return S - S.mean(2, keepdim=True)
 
     @staticmethod
     def layers(layers: nn.ModuleList, x: Tensor) -> Tensor:
-        """Linear layers with ELU between them."""
+        """Apply linear layers with ELU between them."""
         *inner, last = layers
         for layer in inner:
             x = F.elu(layer(x))
@@ -115,7 +119,7 @@ class Twin:
 
     @staticmethod
     def camera(ad: Tensor, ae: Tensor, W: Tensor) -> Tensor:
-        """Steps 1 and 2 of the paper's solver: least squares for both streams, then the nearest rotation by SVD."""
+        """Solve steps 1 and 2 of the paper: least squares for both streams, then the nearest rotation by SVD."""
         S = torch.cat([ae, ad], dim=2)
         M = torch.linalg.lstsq(S.transpose(1, 2), torch.cat([W, W], dim=2).transpose(1, 2)).solution
         U, _, Vt = torch.linalg.svd(M.transpose(1, 2), full_matrices=False)
@@ -124,21 +128,22 @@ class Twin:
 
 
 def timed(step: Callable[[], object]) -> float:
-    """Seconds of a step."""
+    """Return the seconds of a step."""
     begun = time.perf_counter()
     for _ in range(STEPS):
         step()
     return (time.perf_counter() - begun) / STEPS
 
 
-def measure(mode: str, solver: str, batch: int, rounds: int) -> dict:
-    """Frames per second of both, and the ratio of their times."""
+def measure(mode: str, solver: str, batch: int, rounds: int) -> dict[str, Any]:
+    """Measure the frames per second of both, and the ratio of their times."""
     steps = STEPS * (rounds + 2)
     settings = [f"steps={steps}", f"batch={batch}", "start=random", "regression_steps=0"]
     settings += [f"codes={MODES[mode]}", f"solver={solver}"]
     recipe, data = Recipe.load("nrsfm", settings), views()
     with tempfile.TemporaryDirectory() as folder:
-        twin, run = Twin(data, recipe), Trainer(data, recipe, Path(folder)).run()
+        twin, trainer = Twin(data, recipe), Trainer(data, recipe, Path(folder))
+        run = cast(Generator[dict[str, Any], None, None], trainer.run())
         times = []
         for number in range(rounds + 1):
             pair = timed(lambda: next(run)), timed(twin.step)
@@ -156,8 +161,9 @@ def measure(mode: str, solver: str, batch: int, rounds: int) -> dict:
 
 
 def main() -> None:
+    """Measure all cases and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=30, help="of ten steps of either (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=30, help="rounds of ten steps of both (default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the rows as JSON")
     args = parser.parse_args()

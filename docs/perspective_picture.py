@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw ``docs/perspective.png``: what weak perspective costs near the camera, and what the pinhole model gives back.
+"""Draw ``docs/perspective.png``: the errors of weak perspective near the camera, and of the pinhole model.
 
     python docs/perspective_picture.py
 
-The poses of the persons in ``bags/``, their truth turned and put at every distance before the bags' camera, true 2D,
-all points visible; once with their shape known, once lifted by the shipped model. Prints the figures as well. Needs
-matplotlib and rosbags; the same run gives the same picture.
+The true poses of the persons in ``bags/`` are turned and placed at every distance before the bags' camera.  Their 2D
+points are exact and all visible.  The shape is known in one column, and lifted by the shipped model in the other.  The
+figures are printed as well.  Every run draws the same picture.
 """
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
 
 from msg_adapters import Intrinsics
 from paul_ros import metrics
-from paul_ros.files import write_atomically
 from paul_ros.layout import load_layout
-from paul_ros.model_file import load_model
+from paul_ros.model import load_model
 from paul_ros.offline.bag import read_messages
-from paul_ros.orthographic_n_point import OnP, onp
+from paul_ros.offline.figures import new_figure, save_figure
+from paul_ros.onp import OnP, onp
 from paul_ros.pinhole_pose import refine
 from paul_ros.placement import centred_view, place
 
@@ -32,11 +31,11 @@ DIRECTIONS = {"on the axis": (0.0, 0.0, 1.0), "32 degrees beside it": (0.5, 0.2,
 METHODS = ("weak perspective", "one step of undoing it", "refined")
 MEASURES = ("points, where they stand (mm)", "shape and attitude, N-MPJPE (mm)", "reprojection (px)")
 _COLOURS = ("#D55E00", "#E69F00", "#009E73")  # Okabe and Ito
-_EVERY = 4  # frames of the bags
+_EVERY = 4  # every fourth frame of the bags is used
 
 
 def bodies() -> np.ndarray:
-    """(N,17,3) metres about the hips, of both bags."""
+    """Return the true poses (N,17,3) of both bags, metres from the middle of the hips."""
     found = []
     for bag in ("one_person", "two_persons_crossing"):
         for _, _, message, _ in read_messages(HERE.parent / "bags" / f"{bag}.mcap", ["/ground_truth/poses"]):
@@ -45,8 +44,14 @@ def bodies() -> np.ndarray:
     return points - points[:, [11, 12]].mean(1, keepdims=True)
 
 
-def placed(points: np.ndarray, direction: tuple, distance: float) -> np.ndarray:
-    """Turned about the vertical at random and put there; those that would reach behind the camera are left out."""
+def placed(points: np.ndarray, direction: tuple[float, float, float], distance: float) -> np.ndarray:
+    """Turn bodies about the vertical at random and place them; bodies that would reach behind the camera are dropped.
+
+    Args:
+        points: (N,P,3) bodies, metres.
+        direction: from the camera, in its optical frame.
+        distance: in units of the direction, metres.
+    """
     a = np.random.default_rng(0).uniform(0, 2 * np.pi, len(points))
     turn = np.zeros((len(points), 3, 3))
     turn[:, 0, 0] = turn[:, 2, 2] = np.cos(a)
@@ -56,13 +61,13 @@ def placed(points: np.ndarray, direction: tuple, distance: float) -> np.ndarray:
 
 
 def in_space(pose: OnP, S: np.ndarray) -> np.ndarray:
-    """Shapes as a weak-perspective pose places them (N,3,P), shape units."""
+    """Return shapes (N,3,P) as a weak-perspective pose places them, shape units."""
     T = np.concatenate([pose.translation, np.ones((len(S), 1))], axis=1) / pose.scale[:, None]
     return pose.R @ S + T[:, :, None]
 
 
 def solutions(S: np.ndarray, W: np.ndarray, visible: np.ndarray) -> list[np.ndarray]:
-    """Shapes as each of METHODS places them, (N,3,P) in shape units."""
+    """Return the shapes (N,3,P) as each of METHODS places them, shape units."""
     weak = onp(S, W, visible)
     # A pinhole camera at distance 1/s sees u = X / (1/s + Z); weak perspective would have seen s X = u (1 + s Z).
     undone = W * (1 + weak.scale[:, None, None] * (weak.R @ S)[:, 2:])
@@ -73,8 +78,14 @@ def solutions(S: np.ndarray, W: np.ndarray, visible: np.ndarray) -> list[np.ndar
 
 
 def figures(truth: np.ndarray, known: bool) -> list[list[float]]:
-    """Of each method the MEASURES."""
+    """Return a row for each method with its MEASURES.
+
+    Args:
+        truth: (N,17,3) bodies in the optical frame, metres.
+        known: whether the shapes are known; otherwise the shipped model lifts them.
+    """
     model = load_model()
+    assert model.metres_per_unit is not None
     xy, visible = pixels(truth), np.ones(truth.shape[:2], bool)
     view = centred_view(xy, visible, CAMERA)
     visible &= np.isfinite(view.W).all(1)
@@ -94,11 +105,12 @@ def figures(truth: np.ndarray, known: bool) -> list[list[float]]:
 
 
 def pixels(points: np.ndarray) -> np.ndarray:
+    """Project points (...,3) of the optical frame to pixels (...,2)."""
     return points[..., :2] / points[..., 2:] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
 
 
 def table() -> np.ndarray:
-    """(shape known or not, direction, distance, method, measure)."""
+    """Return all figures, by (shape known or lifted, direction, distance, method, measure)."""
     points = bodies()
     return np.array(
         [
@@ -109,19 +121,16 @@ def table() -> np.ndarray:
 
 
 def draw(values: np.ndarray, path: Path) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 8.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    """Draw the figures over distance."""
+    figure = new_figure(9, 8.5, extra="docs")
     axes = figure.subplots(len(MEASURES), 2, sharex=True)
     for column, title in enumerate(("shape known", "lifted by the shipped model")):
         axes[0, column].set_title(title)
         for row, measure in enumerate(MEASURES):
             ax = axes[row, column]
             for way, style in enumerate(("-", "--")):
-                for method, colour in enumerate(_COLOURS):
-                    ax.plot(DISTANCES, values[column, way, :, method, row], style, color=colour, marker=".")
+                for index, colour in enumerate(_COLOURS):
+                    ax.plot(DISTANCES, values[column, way, :, index, row], style, color=colour, marker=".")
             ax.set(xscale="log", ylim=(0, None), xticks=DISTANCES, ylabel="" if column else measure)
             ax.set_xticklabels([f"{d:g}" for d in DISTANCES])
             ax.minorticks_off()
@@ -130,15 +139,14 @@ def draw(values: np.ndarray, path: Path) -> None:
         ax.set_xlabel("distance of the hips (m)")
     for colour, method in zip(_COLOURS, METHODS):
         axes[0, 0].plot([], [], color=colour, label=method)
-    for style, way in zip(("-", "--"), DIRECTIONS):
-        axes[0, 0].plot([], [], style, color="#555555", label=way)
+    for line_style, direction in zip(("-", "--"), DIRECTIONS):
+        axes[0, 0].plot([], [], line_style, color="#555555", label=direction)
     axes[0, 0].legend(frameon=False, fontsize=9)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100, metadata={"Software": None})
-    write_atomically(path, buffer.getvalue())
+    save_figure(figure, path, dpi=100)
 
 
 def main() -> None:
+    """Print the figures and draw them."""
     values = table()
     for known, kind in zip(values, ("known shape", "lifted")):
         print(f"{kind}: {', '.join(MEASURES)}, each for {' / '.join(METHODS)}")

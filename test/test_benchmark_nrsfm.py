@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul benchmark nrsfm`: what reaches the trainer, shuffling, resuming, the choice without truth, table and keys.
+"""`paul benchmark nrsfm`: the trainer's input, shuffling, resuming, the choice without truth, table and keys.
 
 The trainer is a fake that finds each frame's true shape by its image, so that errors are known by construction.
 """
@@ -15,7 +15,7 @@ from paul_ros import cli
 from training import reconstruction
 from training.errors import DataError, TrainingError
 from training.judge import experiments
-from training.judge.experiments import Keeping, Outcome, Run, chosen, perform, summary
+from training.judge.experiments import Experiment, Outcome, SeriesOptions, chosen, perform, summary
 from training.judge.nrsfm import METHODS, find_sequences
 from training.judge.published import NORMALISED_ERROR_PERCENT, published
 from training.judge.truth import Sequence
@@ -33,7 +33,7 @@ def truth(seed):
 
 
 class FakeTrainer:
-    """Gives the true shapes, deeper by 1 + ``excess(seed)``; the loss falls with the seed."""
+    """A trainer that returns the true shapes, deeper by 1 + ``excess(seed)``; the loss falls with the seed."""
 
     def __init__(self, shapes):
         self.shapes = {S[:2].astype(np.float32).tobytes(): S for some in shapes for S in some}
@@ -56,7 +56,7 @@ class FakeTrainer:
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two sequences, and a file without truth."""
+    """Write two sequences, and a file without truth."""
     path = tmp_path / "data"
     path.mkdir()
     for seed, name in enumerate(("drink", "made")):
@@ -96,7 +96,7 @@ def test_each_method_trains_its_recipe(folder, tmp_path, fake):
     assert recipes["rigid"].steps == 0 and recipes["rigid"].start == "rigid"
 
 
-def test_frames_are_shuffled_by_the_seed_and_errors_know_it(folder, tmp_path, fake):
+def test_frames_are_shuffled_by_the_seed_and_put_back_for_errors(folder, tmp_path, fake):
     report = paul(folder, tmp_path, "--seeds", "2", "--sequences", "made", "--methods", "paul")
     given = [data.W for data, _, _ in fake.calls]
     W = truth(1)[:, :2].astype(np.float32)
@@ -108,7 +108,7 @@ def test_frames_are_shuffled_by_the_seed_and_errors_know_it(folder, tmp_path, fa
 
 
 def test_errors_and_the_chosen_seed(folder, tmp_path, fake):
-    """Lowest loss is the last seed's, lowest error the first one's: the choice must not look at errors."""
+    """The last seed has the lowest loss and the first the lowest error; the choice must ignore errors."""
     fake.excess = lambda seed: 0.1 * (1 + seed)
     report = paul(folder, tmp_path, "--seeds", "3", "--sequences", "drink", "--methods", "paul")
     S = truth(0)
@@ -124,7 +124,7 @@ def test_errors_and_the_chosen_seed(folder, tmp_path, fake):
 
 
 def test_no_ground_truth_reaches_the_trainer(folder, tmp_path, fake):
-    """Neither in what it is given nor in any file of its folder; and its data does not change with the truth."""
+    """The trainer's arguments and files hold no truth, and do not change with it."""
     paul(folder, tmp_path, "--seeds", "1", "--sequences", "made", "--methods", "paul")
     data, _, run = fake.calls[0]
     assert {name for name, value in vars(data).items() if isinstance(value, np.ndarray)} == {"W", "visible", "used"}
@@ -162,15 +162,15 @@ def test_another_setting_is_another_run(folder, tmp_path, fake):
     assert len(fake.calls) == 3
 
 
-def test_a_start_stays_a_start_whatever_is_set_for_others(folder, tmp_path, fake, capsys):
+def test_settings_of_training_do_not_apply_to_start_methods(folder, tmp_path, fake, capsys):
     settings = ("start=random", "regression_steps=0", "steps=100", "bottleneck=3")
     options = [word for setting in settings for word in ("--set", setting)]
     paul(folder, tmp_path, "--seeds", "1", "--methods", "paul,linear,rigid", "--sequences", "made", *options)
     found = [(recipe.start, recipe.steps, recipe.bottleneck) for _, recipe, _ in fake.calls]
     assert found == [("random", 100, 3), ("linear", 0, 3), ("rigid", 0, 3)]
-    told = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
-    assert [line.split(":")[0] for line in told] == ["linear", "rigid"]
-    assert all("start=random, regression_steps=0, steps=100 left out" in line for line in told)
+    ignored = [line for line in capsys.readouterr().err.splitlines() if "ignored" in line]
+    assert [line.split(":")[0] for line in ignored] == ["linear", "rigid"]
+    assert all("start=random, regression_steps=0, steps=100 ignored" in line for line in ignored)
 
 
 def test_points_are_hidden_and_the_truth_of_all_judges(folder, tmp_path, fake):
@@ -191,12 +191,12 @@ def test_table_has_the_papers_figures_beside_ours(folder, tmp_path, fake, capsys
     paul(folder, tmp_path, "--seeds", "1", "--plot", str(tmp_path / "b.png"))
     printed = capsys.readouterr()
     assert "PAUL 0.47" in printed.out and "CVPR 2021" in printed.out
-    assert "left out" in printed.err and "unlabelled" in printed.err
+    assert "skipped" in printed.err and "unlabelled" in printed.err
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_published_figures():
-    """Some of each row of the paper's table."""
+    """Some figures of each row equal the paper's."""
     assert published("drink") == published("drink_train") == NORMALISED_ERROR_PERCENT["drink"]
     assert published("shark")["PAUL"] == 0.37 and published("S5_train")["Deep NRSfM"] == 13.40
     assert published("pickup")["BMM-v2"] == 1.98 and published("s123")["CNS"] == 26.46
@@ -204,7 +204,7 @@ def test_published_figures():
 
 
 def outcome(seed, error, loss=0.0):
-    return Outcome(Run(None, "paul", seed), error, error, loss, 1.0, None)
+    return Outcome(Experiment(None, "paul", seed), error, error, loss, 1.0, None)
 
 
 def test_rate_of_bad_basins():
@@ -214,7 +214,7 @@ def test_rate_of_bad_basins():
 
 
 def test_equal_losses_choose_the_first_seed():
-    assert chosen([outcome(1, 5.0), outcome(0, 9.0)]).run.seed == 0
+    assert chosen([outcome(1, 5.0), outcome(0, 9.0)]).experiment.seed == 0
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_equal_losses_choose_the_first_seed():
         (["--hide", "0.9"], "too few points"),
     ],
 )
-def test_what_is_wrong_is_one_line_before_any_training(folder, tmp_path, fake, capsys, options, message):
+def test_errors_are_one_line_before_any_training(folder, tmp_path, fake, capsys, options, message):
     paul(folder, tmp_path, *options, code=1)
     printed = capsys.readouterr().err
     assert message in printed.splitlines()[-1] and "Traceback" not in printed
@@ -251,18 +251,18 @@ def test_the_real_trainer_runs_and_resumes(tmp_path):
     S = truth(0)
     made = Sequence("made", S[:, :2], np.ones((FRAMES, POINTS), bool), S, np.zeros((0, 2), int), False)
     settings = ("start=random", "regression_steps=0", "steps=20", "batch=4", "bottleneck=2", "code_weight=0.01")
-    runs = [Run(made, "paul", 0, settings)]
-    (first,) = perform(runs, Keeping(tmp_path, quiet=True))
+    runs = [Experiment(made, "paul", 0, settings)]
+    (first,) = perform(runs, SeriesOptions(tmp_path, quiet=True))
     assert np.isfinite(first.loss) and first.codes.shape == (FRAMES, 2)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("shapes.npz")}
-    (again,) = perform(runs, Keeping(tmp_path, quiet=True))
+    (again,) = perform(runs, SeriesOptions(tmp_path, quiet=True))
     assert again.ne_flip_global_percent == first.ne_flip_global_percent and len(before) == 1
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("shapes.npz")} == before
 
 
 @pytest.fixture
 def searches(monkeypatch):
-    """What starts were searched for; a start is random shapes of its seed, and takes 100 s."""
+    """Record the searches for starts; each gives random shapes of its seed and takes 100 s."""
     found = []
 
     def search(kind, W, visible, seed, progress):
@@ -280,63 +280,63 @@ def made_runs(*methods, seeds=(0,), settings=()):
     made = Sequence("made", S[:, :2], np.ones((FRAMES, POINTS), bool), S, np.zeros((0, 2), int), False)
     few = ("regression_steps=2", "steps=2", "batch=4", "bottleneck=2")
     own = {"linear": (), "rigid": ()}
-    return [Run(made, method, seed, own.get(method, (*few, *settings))) for seed in seeds for method in methods]
+    return [Experiment(made, method, seed, own.get(method, (*few, *settings))) for seed in seeds for method in methods]
 
 
-def test_runs_that_begin_alike_share_one_start_and_its_seconds(tmp_path, searches):
+def test_experiments_with_equal_starts_share_one_and_its_seconds(tmp_path, searches):
     runs = made_runs("paul", "adl", "linear", "rigid", seeds=(0, 1))
-    outcomes = perform(runs, Keeping(tmp_path, quiet=True))
+    outcomes = perform(runs, SeriesOptions(tmp_path, quiet=True))
     assert searches == [("linear", FRAMES, 0), ("rigid", FRAMES, 0), ("linear", FRAMES, 1), ("rigid", FRAMES, 1)]
     assert all(100 <= outcome.seconds < 110 for outcome in outcomes)
     starts = [path.read_bytes() for path in sorted(tmp_path.glob("starts/*"))]
     assert len(starts) == 4 and {path.read_bytes() for path in tmp_path.glob("made*/run/start.npz")} == set(starts)
 
 
-def test_a_shared_start_gives_what_an_own_one_does(tmp_path, searches):
-    perform(made_runs("paul"), Keeping(tmp_path / "shared", quiet=True))
-    (shared,) = perform(made_runs("adl"), Keeping(tmp_path / "shared", quiet=True))
-    (own,) = perform(made_runs("adl"), Keeping(tmp_path / "own", quiet=True))
+def test_a_shared_start_gives_the_same_as_an_own_one(tmp_path, searches):
+    perform(made_runs("paul"), SeriesOptions(tmp_path / "shared", quiet=True))
+    (shared,) = perform(made_runs("adl"), SeriesOptions(tmp_path / "shared", quiet=True))
+    (own,) = perform(made_runs("adl"), SeriesOptions(tmp_path / "own", quiet=True))
     assert len(searches) == 2 and shared.loss == own.loss
     np.testing.assert_array_equal(shared.codes, own.codes)
 
 
 def test_restarts_share_starts_by_their_seeds(tmp_path, searches):
-    perform(made_runs("paul", settings=("restarts=2",)), Keeping(tmp_path, quiet=True))
-    perform(made_runs("adl", seeds=(0, 1, 2)), Keeping(tmp_path, quiet=True))
-    # The order of the frames is the seed's, so that seed 1 of one run has other data than restart 1 of another.
+    perform(made_runs("paul", settings=("restarts=2",)), SeriesOptions(tmp_path, quiet=True))
+    perform(made_runs("adl", seeds=(0, 1, 2)), SeriesOptions(tmp_path, quiet=True))
+    # Seed 1 of one run has another order of frames, and so other data, than restart 1 of another run.
     assert [seed for _, _, seed in searches] == [0, 1, 1, 2]
 
 
-def test_starts_of_other_scale_data_or_version_are_others(tmp_path, searches, monkeypatch):
-    perform(made_runs("paul"), Keeping(tmp_path, quiet=True))
-    perform(made_runs("paul", settings=("scale=free",)), Keeping(tmp_path, quiet=True))
+def test_other_scales_data_or_versions_have_other_starts(tmp_path, searches, monkeypatch):
+    perform(made_runs("paul"), SeriesOptions(tmp_path, quiet=True))
+    perform(made_runs("paul", settings=("scale=free",)), SeriesOptions(tmp_path, quiet=True))
     assert len(searches) == 2
     hidden = made_runs("adl")
     hidden[0].sequence.visible[0, 0] = False
-    perform(hidden, Keeping(tmp_path, quiet=True))
+    perform(hidden, SeriesOptions(tmp_path, quiet=True))
     assert len(searches) == 3
     monkeypatch.setattr(experiments, "__version__", "another")
-    perform(made_runs("adl"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("adl"), SeriesOptions(tmp_path, quiet=True))
     assert len(searches) == 4
 
 
 def test_fresh_searches_anew_and_a_damaged_start_says_so(tmp_path, searches):
-    perform(made_runs("paul"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paul"), SeriesOptions(tmp_path, quiet=True))
     (shared,) = tmp_path.glob("starts/*")
     shared.write_bytes(shared.read_bytes()[:100])
     with pytest.raises(TrainingError, match="cannot be read.*--fresh"):
-        perform(made_runs("adl"), Keeping(tmp_path, quiet=True))
-    perform(made_runs("paul", "adl"), Keeping(tmp_path, fresh=True, quiet=True))
+        perform(made_runs("adl"), SeriesOptions(tmp_path, quiet=True))
+    perform(made_runs("paul", "adl"), SeriesOptions(tmp_path, fresh=True, quiet=True))
     assert len(searches) == 2
 
 
 def test_a_run_from_random_weights_has_no_start(tmp_path, searches):
-    perform(made_runs("paper"), Keeping(tmp_path, quiet=True))
+    perform(made_runs("paper"), SeriesOptions(tmp_path, quiet=True))
     assert not searches and not (tmp_path / "starts").exists()
 
 
 def test_codes_come_back_in_the_order_of_the_frames(fake, tmp_path):
     S = truth(0)
     made = Sequence("made", S[:, :2], np.ones((FRAMES, POINTS), bool), S, np.zeros((0, 2), int), False)
-    (found,) = experiments.perform([Run(made, "paul", 5)], Keeping(tmp_path, quiet=True))
+    (found,) = experiments.perform([Experiment(made, "paul", 5)], SeriesOptions(tmp_path, quiet=True))
     np.testing.assert_array_equal(found.codes, S[:, 0, :4].astype(np.float32))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``benchmarks/curve.py``: errors on the way, from the truth as well, and a run that goes on where it was stopped."""
+"""``benchmarks/curve.py``: errors during training, the start from the truth, and resuming."""
 
 import importlib.util
 import json

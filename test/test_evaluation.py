@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul evaluate`: errors whose value is known by construction, hidden points, scales, and clear refusals."""
+"""`paul evaluate`: errors of known size, hidden points, scales, and bad input."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from paul_ros import cli, metrics
 from paul_ros.layout import load_layout
 from paul_ros.model_file import load_model, save_model
 from training.errors import DataError
-from training.judge import evaluation
+from training.judge import evaluation, prediction
 from training.judge.truth import Sequence, load_sequence, random_rotations
 from training.reconstruction import Reconstruction
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def turned(model_file, count=12, size=50.0, seed=0):
-    """The model's only shape in random poses, (F,3,P), in image units."""
+    """Return the model's only shape in random poses (F,3,P), image units."""
     return size * random_rotations(count, seed) @ load_model(model_file).mean_shape.astype(float)
 
 
@@ -40,7 +40,7 @@ def evaluate(model, data, tmp_path, *options):
 # --- the measures
 
 
-def test_deep_nrsfms_error_forgives_what_it_says_and_nothing_else():
+def test_deep_nrsfms_error_ignores_similarity_and_reflection_only():
     truth = np.random.default_rng(0).standard_normal((6, 9, 3))
     similar = 3 * metrics.flip_depth(truth) @ random_rotations(6, 1).transpose(0, 2, 1) + 5
     np.testing.assert_allclose(metrics.normalised_error_o3(similar, truth), 0, atol=1e-12)
@@ -92,7 +92,7 @@ def test_a_perfect_model_has_no_error_and_the_observed_scale(model_file, tmp_pat
 
 
 def test_errors_have_their_closed_form(model_file, tmp_path):
-    """Truth 10 % larger in depth alone than what the model can give: NE follows from the depths."""
+    """The truth is 10 % deeper than the model can be, so NE follows from the depths."""
     S = turned(model_file)
     truth = S.copy()
     truth[:, 2] *= 1.1
@@ -115,7 +115,7 @@ def test_distances_of_metric_truth_are_in_millimetres(model_file, tmp_path):
         assert metric[f"{name}_mm"] == pytest.approx(1000 * units[f"{name}_units"])
 
 
-def test_hidden_points_count_and_are_told_apart(model_file, tmp_path):
+def test_hidden_points_count_and_have_an_error_of_their_own(model_file, tmp_path):
     S = turned(model_file)
     visible = np.ones((12, 17), bool)
     visible[:, 9] = False
@@ -128,15 +128,15 @@ def test_hidden_points_count_and_are_told_apart(model_file, tmp_path):
 
 
 def test_errors_are_also_those_of_s_cam(model_file, tmp_path):
-    """With x and y of visible points as they were seen, what is left is their depth and the whole of hidden ones."""
+    """S_cam leaves the depth errors of visible points and all errors of hidden ones."""
     S = turned(model_file)
     truth = S + np.random.default_rng(0).normal(0, 2.0, S.shape)
     visible = np.ones((12, 17), bool)
     visible[:, 9] = False
     data = write(tmp_path / "d.npz", truth, W=truth[:, :2], visible=visible)
     report = evaluate(model_file, data, tmp_path)
-    found = evaluation.predict(load_model(model_file), truth[:, :2], visible).S.astype(float)
-    off = found - evaluation.centred(truth, visible)
+    found = prediction.predict(load_model(model_file), truth[:, :2], visible).S.astype(float)
+    off = found - prediction.centred(truth, visible)
     off[:, :2] *= ~visible[:, None]
     off -= off.mean(2, keepdims=True)
     size = np.linalg.norm(truth - truth.mean(2, keepdims=True), axis=(1, 2))
@@ -147,7 +147,7 @@ def test_errors_are_also_those_of_s_cam(model_file, tmp_path):
     assert report["observed"]["reprojection_median_percent"] == pytest.approx(0, abs=1e-3)
 
 
-def test_what_a_hidden_point_holds_is_not_looked_at(model_file, tmp_path):
+def test_values_of_hidden_points_are_ignored(model_file, tmp_path):
     S = turned(model_file)
     visible = np.random.default_rng(0).random((12, 17)) < 0.7
     W = np.where(visible[:, None], S[:, :2], np.nan)
@@ -157,7 +157,7 @@ def test_what_a_hidden_point_holds_is_not_looked_at(model_file, tmp_path):
     assert nan["ne_flip_global_percent"] == flagged["ne_flip_global_percent"]
 
 
-def test_truth_that_is_not_known_counts_for_nothing(model_file, tmp_path):
+def test_points_without_truth_count_for_nothing(model_file, tmp_path):
     S = turned(model_file)
     truth = S.copy()
     truth[:, 2, :] *= 1.1
@@ -171,7 +171,7 @@ def test_truth_that_is_not_known_counts_for_nothing(model_file, tmp_path):
 
 
 def test_mirror_image_of_unknown_chirality_is_forgiven_as_a_whole(model_file, tmp_path):
-    """The model's mirror image gives the same views; where its chirality is known, it is an error."""
+    """Mirror images have equal views; they are errors only if the model's chirality is known."""
     S = turned(model_file)
     data = write(tmp_path / "d.npz", S * [[1], [1], [-1]])
     known = evaluate(model_file, data, tmp_path)
@@ -185,7 +185,7 @@ def test_mirror_image_of_unknown_chirality_is_forgiven_as_a_whole(model_file, tm
 
 
 def test_a_model_of_unit_scale_keeps_its_size(model_file, tmp_path):
-    """Seen twice as large as its size, it cannot follow; one of free scale can."""
+    """A model of unit scale cannot fit a view twice as large; one of free scale can."""
     free = load_model(model_file)
     header = {**free.header, "scale": "unit", "image_unit": 50.0, "metres_per_unit": None}
     save_model(tmp_path / "unit.npz", header, {**free.weights, "mean_shape": free.mean_shape})
@@ -196,7 +196,7 @@ def test_a_model_of_unit_scale_keeps_its_size(model_file, tmp_path):
 
 
 def test_the_baseline_is_the_rigid_mean_shape(model_file, tmp_path):
-    """Of a model that knows one shape only, both are the same."""
+    """A model of a single shape equals its baseline."""
     report = evaluate(model_file, write(tmp_path / "d.npz", turned(model_file) * [[1], [1], [1.2]]), tmp_path)
     for key, value in report["baseline"].items():
         assert report[key] == pytest.approx(value, rel=1e-6, abs=1e-5)  # % and units: the reprojection is next to 0
@@ -282,7 +282,7 @@ def test_data_or_truth_must_be_named(model_file, capsys):
         assert end.value.code == 2 and "--truth" in capsys.readouterr().err
 
 
-def test_a_picture_of_no_known_kind_is_told_before_any_work(model_file, monkeypatch, capsys):
+def test_a_picture_of_unknown_format_is_refused_before_any_work(model_file, monkeypatch, capsys):
     monkeypatch.setattr(evaluation, "evaluate_model", lambda *_: pytest.fail("evaluated in vain"))
     with pytest.raises(SystemExit) as end:
         cli.main(["evaluate", str(model_file), "data.npz", "--plot", "e.xyz"])
@@ -297,7 +297,7 @@ def sequence(frames=30, points=20, seed=0):
     return Sequence("made", S[:, :2].copy(), np.ones((frames, points), bool), S, np.zeros((0, 2), int), False)
 
 
-def test_hiding_hides_that_share_of_every_frame_and_says_nothing_of_it():
+def test_hiding_hides_that_share_of_every_frame_and_its_coordinates():
     hidden = sequence().hiding(0.3, seed=1)
     assert (hidden.visible.sum(1) == 14).all() and (hidden.W.transpose(0, 2, 1)[~hidden.visible] == 0).all()
     assert (hidden.visible.any(0)).all() and not np.array_equal(hidden.visible, sequence().hiding(0.3, 2).visible)
@@ -322,14 +322,14 @@ def test_random_cameras_see_the_same_shapes():
     np.testing.assert_allclose(metrics.pa_mpjpe(points, true), 0, atol=1e-12)
     unknown = sequence()
     unknown.S[0, 0, 0] = np.nan
-    with pytest.raises(DataError, match="not known"):
+    with pytest.raises(DataError, match="unknown"):
         unknown.from_random_cameras(0)
 
 
 def test_mean_shape_of_one_shape_in_many_poses_is_that_shape():
     shape = np.random.default_rng(0).standard_normal((3, 9))
     R = random_rotations(20, 0)
-    mean = evaluation.rigid_mean(R @ shape * np.linspace(1, 3, 20)[:, None, None], R)
+    mean = prediction.rigid_mean(R @ shape * np.linspace(1, 3, 20)[:, None, None], R)
     assert metrics.pa_mpjpe(mean.T[None], shape.T[None])[0] == pytest.approx(0, abs=1e-12)
     assert np.sqrt((mean**2).sum(0).mean()) == pytest.approx(1)
 
@@ -377,7 +377,7 @@ def test_frames_that_were_left_out_of_a_reconstruction_are_counted(tmp_path):
 
 
 def test_the_baseline_of_a_reconstruction_is_its_rigid_mean(tmp_path):
-    """Of one shape in many poses it is that shape; of many shapes it is far from them."""
+    """The baseline of one shape in many poses is that shape; it is far from many different shapes."""
     shape = np.random.default_rng(0).standard_normal((3, 20))
     shape -= shape.mean(1, keepdims=True)
     R = random_rotations(30, 7)

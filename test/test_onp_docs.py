@@ -1,29 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What docs/explanation/onp.md says: its example runs, its tables are those that its script prints, its formulas hold."""
+"""The explanation of OnP: its example runs, its script prints its tables, and its formulas hold."""
 
 from __future__ import annotations
 
-import importlib.util
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_links import broken_links
 
-from paul_ros.orthographic_n_point import onp
+from paul_ros.onp import onp
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-PAGE = DOCS / "explanation/onp.md"
+sys.path.append(str(DOCS))
+
+import onp_pictures as pictures
+import onp_tables
+
+PAGE = next(DOCS.rglob("onp.md"))
 TABLES = ("certificate", "failures", "uncertified", "optima", "approximation")
-
-
-@pytest.fixture(scope="module")
-def pictures():
-    spec = importlib.util.spec_from_file_location("onp_pictures", DOCS / "onp_pictures.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def cells(row: str) -> list[str]:
@@ -31,7 +28,7 @@ def cells(row: str) -> list[str]:
 
 
 def differences(printed: list[str], page: str) -> list[tuple[str, str]]:
-    """Cells of a printed table that the page has otherwise, by more than rounding on another machine explains."""
+    """Return cells in which page and printed table differ by more than the rounding of other machines."""
     start = page.index(printed[0] + "\n")
     quoted = page[start:].splitlines()[: len(printed)]
     pairs = [pair for rows in zip(printed, quoted, strict=True) for pair in zip(*map(cells, rows), strict=True)]
@@ -48,8 +45,8 @@ def _agree(x: str, y: str) -> bool:
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_the_page_quotes_what_its_script_prints(pictures, name):
-    assert differences(getattr(pictures, f"{name}_table")(), PAGE.read_text()) == []
+def test_the_page_quotes_what_its_script_prints(name):
+    assert differences(getattr(onp_tables, f"{name}_table")(), PAGE.read_text()) == []
 
 
 def test_a_wrong_quotation_is_found():
@@ -76,14 +73,14 @@ def test_the_example_runs():
 
 
 @pytest.mark.parametrize("scale", ["free", "unit"])
-def test_goal_and_residual_as_written(pictures, scale):
-    """The residual from g by the page's formulas is that of the pose, and no direction has a smaller one."""
+def test_goal_and_residual_as_written(scale):
+    """The page's formulas give the residual of the pose, and no direction has a smaller one."""
     for seed in range(10):
         S, W, _ = pictures.random_problems(1, 7, 0.4, 0.5, seed)
         W = 3.0 * W
         problems, V = pictures.reduced(S, W)
-        problem, found = pictures.one(problems), onp(S, W, scale=scale)
-        every = np.array(pictures.vs.fibonacci_sphere(500))
+        problem, found = pictures.single(problems), onp(S, W, scale=scale)
+        every = np.array(pictures.vs._fibonacci_sphere(500))
         n = np.concatenate([found.R[:1, 2] @ V[0], every])
         g = pictures.goal(problem, *pictures.energies(problem, n), scale)
         residual = pictures.relative_residual(problem.k, g, scale) * np.sqrt(W[0].var(1).sum())
@@ -102,7 +99,7 @@ def test_the_certificates_lemma_is_an_identity():
         assert rise == pytest.approx(-(n - best) @ (multiplier * np.eye(3) - K) @ (n - best))
 
 
-def test_the_map_keeps_directions(pictures):
+def test_the_map_keeps_directions():
     frame = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
     p, n = pictures.disc_grid(frame, size=21)
     on = (p**2).sum(-1) < 0.99
@@ -110,7 +107,7 @@ def test_the_map_keeps_directions(pictures):
     np.testing.assert_allclose(np.linalg.norm(n[on], axis=1), 1)
 
 
-def test_the_pictures_can_be_drawn(pictures, tmp_path):
+def test_the_pictures_can_be_drawn(tmp_path):
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     pictures.draw_maps(tmp_path / "maps.png")

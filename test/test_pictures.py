@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the benchmark and of studies: what is drawn where, from made-up outcomes."""
+"""Pictures of the benchmark and of studies, drawn from artificial outcomes."""
 
 from __future__ import annotations
 
@@ -8,21 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from training.judge import nrsfm as benchmark
-from training.judge.experiments import Outcome, Run
+from training.judge import nrsfm
+from training.judge.experiments import Experiment, Outcome
 from training.judge.pictures import new_figure, percent_axis
 from training.judge.published import NORMALISED_ERROR_PERCENT
-from training.judge.studies.study import studies
+from training.judge.studies.registry import STUDIES
 from training.judge.truth import Sequence
 
 FRAMES = 30
 
 
-def outcomes(runs, error, ratio=1.0):
-    """Errors with one flip for all are larger by that ratio; codes lie on the right half of a ring about (5, 5)."""
+def outcomes(experiments, error, ratio=1.0):
+    """Return outcomes with codes on the right half of a ring about (5, 5).
+
+    Args:
+        experiments: of the outcomes.
+        error: gives the error of an experiment, flip per frame.
+        ratio: of the error with one flip for all to that one.
+    """
     angle = np.linspace(-np.pi / 2, np.pi / 2, FRAMES)
     codes = 5 + np.stack([np.cos(angle), np.sin(angle)], 1)
-    return [Outcome(run, error(run), ratio * error(run), run.seed, 1.0, codes) for run in runs]
+    return [Outcome(one, error(one), ratio * error(one), one.seed, 1.0, codes) for one in experiments]
 
 
 def sequences(*names):
@@ -31,8 +37,8 @@ def sequences(*names):
 
 
 def drawn(name, error, seeds=2, ratio=1.0):
-    study = studies()[name]
-    found = outcomes(study.runs(sequences("drink"), seeds, study.values, ()), error, ratio)
+    study = STUDIES[name]
+    found = outcomes(study.plan(sequences("drink"), seeds, study.values, ()), error, ratio)
     return study.draw(found, study.report(found))
 
 
@@ -57,7 +63,7 @@ def test_ticks_of_errors_are_several_and_do_not_overlap(errors, scale):
 
 @pytest.mark.parametrize("name", ["bottleneck", "noise", "hidden"])
 def test_sweeps_show_one_flip_for_all_beside_flip_per_frame(name):
-    figure = drawn(name, lambda run: 2.0 + run.value, ratio=3.0)
+    figure = drawn(name, lambda one: 2.0 + one.value, ratio=3.0)
     (ax,) = figure.axes
     dashed, solid = (
         line for style in ("--", "-") for line in ax.lines if line.get_linestyle() == style and len(line.get_ydata())
@@ -68,7 +74,7 @@ def test_sweeps_show_one_flip_for_all_beside_flip_per_frame(name):
 
 
 def test_the_median_of_a_bar_is_at_its_foot_not_above_the_highest_run():
-    figure = drawn("auto_decoder", lambda run: (2.0, 30.0, 3.0)[run.seed], seeds=3)
+    figure = drawn("auto_decoder", lambda one: (2.0, 30.0, 3.0)[one.seed], seeds=3)
     (ax,) = figure.axes
     assert [(text.get_text(), text.xy[1]) for text in ax.texts] == [("3.00", 0)] * 3
     assert [text.xy[0] for text in ax.texts] == pytest.approx([bar.get_x() + bar.get_width() / 2 for bar in ax.patches])
@@ -76,7 +82,7 @@ def test_the_median_of_a_bar_is_at_its_foot_not_above_the_highest_run():
 
 
 def test_codes_fill_their_panel_and_nothing_lies_over_them():
-    figure = drawn("latent", lambda run: 3.0)
+    figure = drawn("latent", lambda one: 3.0)
     panels = figure.axes[:4]
     assert [ax.get_title().splitlines()[0] for ax in panels[:2]] == ["drink, own cameras", "drink, random cameras"]
     assert all("roughness 0." in ax.get_title() and not ax.texts for ax in panels)
@@ -88,10 +94,10 @@ def test_codes_fill_their_panel_and_nothing_lies_over_them():
 
 def test_the_benchmark_names_methods_and_rivals(monkeypatch):
     kept = []
-    monkeypatch.setattr(benchmark, "save_figure", lambda figure, path: kept.append(figure))
-    methods = [*benchmark.METHODS, "/home/me/own.yaml"]
-    runs = [Run(sequence, method, 0) for sequence in sequences("drink", "S5") for method in methods]
-    benchmark.write_picture(Path("b.png"), benchmark.report(outcomes(runs, lambda run: 2.0)))
+    monkeypatch.setattr(nrsfm, "save_figure", lambda figure, path: kept.append(figure))
+    methods = [*nrsfm.METHODS, "/home/me/own.yaml"]
+    experiments = [Experiment(sequence, method, 0) for sequence in sequences("drink", "S5") for method in methods]
+    nrsfm.write_picture(Path("b.png"), nrsfm.report(outcomes(experiments, lambda one: 2.0)))
     (figure,) = kept
     names = legend_names(figure)
     assert names[:6] == ["PAUL", "ADL", "ADL + low rank", "linear", "rigid", "own"]

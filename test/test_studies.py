@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul study`: what is varied, what is reported, resuming, and pictures that are there."""
+"""`paul study`: varied quantities, reports, resuming, pictures."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 
 from paul_ros import cli
-from paul_ros.cli.study import STUDIES
 from paul_ros.layout import anonymous_layout
-from paul_ros.model_file import load_model, save_model, weight_shapes
+from paul_ros.model import load_model, save_model, weight_shapes
 from training import reconstruction
 from training.categories import joint_layout
-from training.judge.studies import interpolation
+from training.judge.studies import interpolation, registry
 from training.judge.studies.latent import roughness
-from training.judge.studies.study import studies
 from training.judge.truth import random_rotations
 from training.reconstruction import Reconstruction
 
@@ -28,7 +26,7 @@ FRAMES, POINTS = 12, 14
 
 
 class FakeTrainer:
-    """Flat shapes; the depth that is missing is the error. Keeps what it was given."""
+    """A trainer that returns flat shapes, so that the missing depth is the error; it records its calls."""
 
     def __init__(self):
         self.calls = []
@@ -114,14 +112,24 @@ def test_latent_spaces_have_two_dimensions_and_both_kinds_of_cameras(files, tmp_
     assert "roughness" in capsys.readouterr().out
 
 
-def test_roughness_tells_a_thread_from_noise():
-    thread = np.stack([np.linspace(0, 1, 500), np.linspace(0, 2, 500)], axis=1)
+def test_roughness_tells_a_curve_from_noise():
+    curve = np.stack([np.linspace(0, 1, 500), np.linspace(0, 2, 500)], axis=1)
     rng = np.random.default_rng(0)
-    assert roughness(thread) == pytest.approx(3 / 499, rel=0.05)
-    assert roughness(rng.permutation(thread)) == pytest.approx(1, abs=0.1)
+    assert roughness(curve) == pytest.approx(3 / 499, rel=0.05)
+    assert roughness(rng.permutation(curve)) == pytest.approx(1, abs=0.1)
 
 
-def test_a_study_goes_on_where_it_was(files, tmp_path, fake):
+def test_codes_of_untrained_networks_are_refused_before_any_training(files, tmp_path, fake, capsys):
+    options = ["--seeds", "1", "--set", "steps=0"]
+    study("latent", files, tmp_path, *options, code=1)
+    printed = capsys.readouterr().err
+    assert "study latent needs the codes of trained networks, and method paul trains none" in printed
+    assert printed.count("\n") == 1 and not fake.calls
+    study("bottleneck", files[:1], tmp_path, *options, "--values", "2")
+    assert len(fake.calls) == 1
+
+
+def test_an_interrupted_study_continues(files, tmp_path, fake):
     study("bottleneck", files[:1], tmp_path, "--seeds", "1", "--values", "2,3")
     report = study("bottleneck", files[:1], tmp_path, "--seeds", "2", "--values", "2,3,4")
     assert len(fake.calls) == 6 == len(report["rows"])
@@ -130,7 +138,7 @@ def test_a_study_goes_on_where_it_was(files, tmp_path, fake):
 
 
 def test_the_benchmark_and_every_study_share_runs(files, tmp_path, fake):
-    """One mechanism: a run is known by what it does, not by who asks for it."""
+    """A run is identified by its data and recipe, whichever command asks for it."""
     study("auto_decoder", files[:1], tmp_path, "--seeds", "1")
     words = ["--data", str(tmp_path), "--sequences", "one", "--methods", "paul", "--seeds", "1", "--quiet"]
     assert cli.main(["benchmark", "nrsfm", *words, "--work", str(tmp_path / "out" / "work")]) == 0
@@ -158,7 +166,7 @@ def test_interpolation_draws_the_line_between_two_codes(model_file, tmp_path, ca
 
 
 def random_model(path, layout):
-    """A model file of random weights."""
+    """Write a model of random weights."""
     header = {
         "layout": layout.to_dict(),
         "bottleneck": 2,
@@ -178,7 +186,7 @@ def random_model(path, layout):
 
 @pytest.mark.parametrize("far_off", [0.0, 9.0])
 def test_interpolation_of_a_category_shows_its_own_points(tmp_path, files, far_off, monkeypatch):
-    """What the model has for points of the other category counts for nothing, and is not drawn."""
+    """The model's points of the other category count for nothing and are not drawn."""
     drawn = []
     monkeypatch.setattr(interpolation, "save_figure", lambda figure, path: drawn.append(figure))
     layout = joint_layout(["one", "other"], [anonymous_layout(POINTS, ((0, 1),)), anonymous_layout(5)])
@@ -201,10 +209,11 @@ def test_interpolation_of_a_category_shows_its_own_points(tmp_path, files, far_o
     ]
     for ax in axes:
         points = np.ma.filled(ax.collections[-1].get_offsets(), np.nan)
-        assert np.isfinite(points).all(1).sum() == POINTS and len(ax.lines) == 1
+        bones = ax.collections[0].get_segments()
+        assert np.isfinite(points).all(1).sum() == POINTS and len(bones) == 1 and np.isfinite(bones[0]).all()
 
 
-def test_interpolation_needs_no_truth_and_names_frames_that_do_not_count(tmp_path, model_file, capsys):
+def test_interpolation_needs_no_truth_and_names_frames_that_are_not_counted(tmp_path, model_file, capsys):
     S = np.random.default_rng(0).standard_normal((4, 3, 17))
     visible = np.ones((4, 17), bool)
     visible[1, 2:] = False
@@ -222,7 +231,7 @@ def test_interpolation_needs_no_torch(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_frames_that_are_not_there_are_named(files, tmp_path, model_file, capsys):
+def test_missing_frames_are_named(files, tmp_path, model_file, capsys):
     S = np.random.default_rng(0).standard_normal((3, 3, 17))
     np.savez(tmp_path / "seen.npz", W=S[:, :2], S=S)
     options = "--model", str(model_file), "--frames", "1,3"
@@ -238,8 +247,8 @@ def test_two_files_of_one_name_are_refused(files, tmp_path, fake, capsys):
 
 
 def test_every_study_of_the_command_line_is_there(capsys):
-    assert set(STUDIES) == set(studies())
-    for name in (*STUDIES, "interpolation"):
+    assert set(cli._STUDIES) == set(registry.STUDIES)
+    for name in (*cli._STUDIES, "interpolation"):
         with pytest.raises(SystemExit) as end:
             cli.main(["study", name, "--help"])
         assert end.value.code == 0 and "examples:" in capsys.readouterr().out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The made-up dense body: it moves, its bones do not bend, cameras are rotations, the same seed gives the same."""
+"""The synthetic dense body: it moves, its bones do not bend, cameras are rotations, seeds fix all."""
 
 import subprocess
 import sys
@@ -40,7 +40,7 @@ def test_bones_keep_their_shape_and_joints_bend():
 
 
 def test_no_view_is_a_mirror_image():
-    """The trunk of every frame turns onto that of the body at rest, and not onto its mirror image."""
+    """A rotation takes the trunk of every frame to the trunk at rest; none takes it to the mirror image."""
     trunk = np.flatnonzero(_skin(1500).reshape(1500, len(_BONES), 4)[:, 0, 3] > 0.999)
     rest = _surface(1500).T[:, trunk]
     S = articulated_mesh(1500, 50)[:, :, trunk].astype(float)
@@ -66,7 +66,7 @@ def test_edges_join_near_points_once():
     assert all(tuple(sorted((a, int(b)))) in found for a, b in enumerate(distance.argmin(1)))
 
 
-def test_the_file_can_be_trained_on_and_holds_no_truth_unasked(tmp_path):
+def test_the_file_can_be_trained_on_and_holds_truth_only_if_asked(tmp_path):
     command = [
         sys.executable,
         "-m",

@@ -28,9 +28,10 @@ from training.distributed import from_first, is_first, joined
 from training.encoder_fit import fit_encoder
 from training.errors import DataError, MocapError, RecipeError, TrainingError
 from training.export import architecture, export_model
-from training.people.human_data import check_outside, make_file, motion_files, views_of
-from training.people.mocap import human_layout
-from training.people.view_settings import Views
+from training.people.clips import motion_files
+from training.people.human_data import check_outside, make_file, views_of
+from training.people.human_points import human_layout
+from training.people.view_settings import ViewSettings
 from training.recipe import Recipe, recipe_names
 from training.reconstruction import Run, reconstruction_of, restarts, run_folder, train_restarts
 from training.start.kept_start import START, Progress
@@ -176,7 +177,7 @@ def _load_people(
     return load_files([path], layout)
 
 
-def _make_views(capture: Path, views: Views, path: Path, args: argparse.Namespace) -> bytes | None:
+def _make_views(capture: Path, views: ViewSettings, path: Path, args: argparse.Namespace) -> bytes | None:
     """What went wrong, for all processes: one that raised here would leave the others waiting."""
     try:
         if args.fresh:

@@ -13,7 +13,7 @@ import yaml
 
 from paul_ros.layout import Layout
 from training.errors import RecipeError, ViewsError
-from training.people.view_settings import Views
+from training.people.view_settings import ViewSettings
 
 #: Settings that are one of a few words.
 CHOICES = {
@@ -80,7 +80,9 @@ class Recipe:
     hide: float = 0.0  # up to this share of a frame's points is hidden anew at every step
     known_lengths: tuple[tuple[str, str, float], ...] = ()  # (point, point, metres): sets the metres per model unit
     stature: float = 0.0  # metres, of the people who have these lengths; 0: no people
-    views: Views | None = None  # how people are seen, where the data is a folder of motion capture (view_settings.py)
+    views: ViewSettings | None = (
+        None  # how people are seen, where the data is a folder of motion capture (view_settings.py)
+    )
 
     @classmethod
     def load(cls, name_or_path: str | Path, overrides: list[str] = ()) -> Recipe:
@@ -205,7 +207,7 @@ def _converted(key: str, value: object, default: object) -> object:
     """The value in the default's type; lists become tuples."""
     if key == "views":
         try:
-            return value if value is None or isinstance(value, Views) else Views.from_dict(value)
+            return value if value is None or isinstance(value, ViewSettings) else ViewSettings.from_dict(value)
         except ViewsError as error:
             raise RecipeError(str(error)) from None
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):

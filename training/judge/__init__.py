@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judge models and reconstructions against 3D truth: evaluation, benchmark, studies, pictures."""
+"""Evaluation of models and reconstructions against 3D truth; the trainer reads none of it."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of `paul evaluate --plot`: frames over their truth, and the errors of all frames in order of size."""
+"""Picture of `paul evaluate --plot`: frames over their truth, and the errors of all frames in order of size."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from paul_ros import metrics
-from training.judge.evaluation import Comparison, errors_of_signs, pair
+from training.judge.comparison import Comparison, errors_of_signs, pair
 from training.judge.pictures import (
+    BASELINE_COLOUR,
     COLOURS,
-    bare,
     draw_shape,
+    frame_panels,
     new_figure,
     percent_axis,
     save_figure,
@@ -22,10 +23,16 @@ from training.judge.pictures import (
 )
 
 _SHARES = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+"""Frames that are drawn, by the share of frames with a smaller error."""
 
 
 def write_picture(path: str | Path, compared: Comparison, title: str) -> None:
-    """Draw and write. Raises ImportError without matplotlib, PictureError for an odd suffix."""
+    """Draw the picture and write it.
+
+    Raises:
+        MissingPackageError: matplotlib is not installed.
+        PictureError: matplotlib cannot write the format of the suffix.
+    """
     signs = errors_of_signs(compared.found.S, compared.truth, compared.rows)
     rigid = errors_of_signs(compared.rigid.S, compared.truth, compared.rows).min(1)
     error, flipped = 100 * signs.min(1), signs[:, 1] < signs[:, 0]
@@ -42,7 +49,7 @@ def write_picture(path: str | Path, compared: Comparison, title: str) -> None:
 
 
 def _draw_frames(axes: Any, compared: Comparison, predicted: np.ndarray, true: np.ndarray, error: np.ndarray) -> None:
-    """As the camera sees them, and from the side; over the truth in grey, the error in red."""
+    """Draw frames as the camera sees them and from the side, over the truth in grey, with errors as red lines."""
     predicted, true = ((points - points.mean(1, keepdims=True)).transpose(0, 2, 1) for points in (predicted, true))
     size = np.linalg.norm(true, axis=(1, 2))[:, None, None]
     predicted, true = predicted / size, true / size
@@ -51,21 +58,21 @@ def _draw_frames(axes: Any, compared: Comparison, predicted: np.ndarray, true: n
         for ax, shape, truth in zip(row, view(predicted), view(true)):
             draw_shape(ax, shape, compared.truth.edges, COLOURS[0], truth)
         row[0].text(-0.04, 0.5, name, rotation=90, va="center", ha="right", transform=row[0].transAxes, fontsize=10)
-    bare(axes, np.stack([view(S) for _, view in views for S in (predicted, true)]))
+    frame_panels(axes, np.stack([view(S) for _, view in views for S in (predicted, true)]))
     for ax, share, value in zip(axes[0], _SHARES, error):
-        name = (
-            "worst frame"
-            if share == 1
-            else "median frame"
-            if share == 0.5
-            else f"{100 * share:g} % of frames are better"
-        )
-        ax.set_title(f"{name}\nNE {value:.2f} %", fontsize=10)
+        ax.set_title(f"{_frame_name(share)}\nNE {value:.2f} %", fontsize=10)
+
+
+def _frame_name(share: float) -> str:
+    """Return the name of the frame whose error exceeds those of this share of the frames."""
+    names = {1.0: "worst frame", 0.5: "median frame"}
+    return names.get(share, f"{100 * share:g} % of frames are better")
 
 
 def _draw_curve(ax: Any, found: np.ndarray, rigid: np.ndarray) -> None:
+    """Draw sorted errors (M,) of prediction and baseline over the share of frames."""
     share = 100 * (np.arange(len(found)) + 0.5) / len(found)
-    ax.plot(share, rigid, color="#9a9a9a", label="rigid mean shape")
+    ax.plot(share, rigid, color=BASELINE_COLOUR, label="rigid mean shape")
     ax.plot(share, found, color=COLOURS[0], label="predicted")
     ax.set(xlabel="share of frames that are better, %", xlim=(0, 100))
     percent_axis(ax)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many training runs in a row, for benchmark and studies: resumable, and judged by a truth that no run has seen.
+"""Series of experiments for the benchmark and the studies: resumable, and judged by a truth that no trainer sees.
 
-A run is given its frames in an order of its seed's own, and only where points were seen: W and visible. Its folder
-under the work folder is named by what it depends on (data, recipe, seed, version of this package), so that an
-interrupted series goes on where it was and a changed setting begins anew. What is kept is the reconstruction; errors
-are computed whenever it is read. Starts are kept beside the runs, for all that begin with the same one to share it: it
-is found once, and the time that took counts for each of them.
+An experiment is one training run.  The trainer gets W and visible only, in an order of frames that depends on the seed.
+The name of the experiment's folder is a digest of data, recipe, seed and package version.  An interrupted series
+therefore continues, and a changed setting trains anew.  The folder keeps the reconstruction; errors are computed
+whenever it is read.
+
+Starts are kept beside the experiments.  Experiments with equal starts share one, and its search time counts for each.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -31,31 +33,35 @@ from paul_ros.normalisation import enough_visible
 from training import reconstruction
 from training.data import TrainingData, load_training_data
 from training.errors import DataError, RecipeError
-from training.judge.evaluation import LEAST_VISIBLE, errors_of_signs
+from training.judge.comparison import errors_of_signs
+from training.judge.prediction import MIN_POINTS
 from training.judge.truth import Sequence
 from training.recipe import Recipe
 from training.reconstruction import Reconstruction
 from training.start.kept_start import START, start_identity
 
+Item = TypeVar("Item")
+
 RECIPES = {"paul": "nrsfm"}
-"""Recipes of methods whose name is not their recipe's."""
+"""Method -> recipe, for methods that are not named like their recipe."""
 
 _STARTS = "starts"
 
 BAD_BASIN = 3.0
-"""A run is in a bad basin where its NE, one flip for all, is above so many times the median of its method's runs."""
+"""Threshold of a bad basin: its NE with one flip for all, over the median of its method's experiments."""
 
 
 @dataclass(frozen=True)
-class Run:
-    """One training run.
+class Experiment:
+    """One training run, and the truth that judges it.
 
     Attributes:
-        sequence: what is reconstructed, and the truth that judges it.
-        method: a name of RECIPES, or a recipe by name or file.
+        sequence: frames to reconstruct, with their truth.
+        method: a name of ``RECIPES``, or a recipe by name or file.
         seed: of training and of the frames' order.
-        settings: overrides of the recipe, as ``--set`` takes them.
-        detail: what sets the run apart from others of its series, for people; value: the same, to sort by.
+        settings: overrides of the recipe, as for ``--set``.
+        detail: the varied setting, for the progress bar.
+        value: the varied setting, as a key of groups.
     """
 
     sequence: Sequence
@@ -66,7 +72,11 @@ class Run:
     value: float | str = ""
 
     def recipe(self) -> Recipe:
-        """Its recipe; raises RecipeError. A recipe that trains several runs itself has seeds of its own in each."""
+        """Return the recipe; experiments share no seed, even if the recipe restarts with several.
+
+        Raises:
+            RecipeError: there is no such recipe, or a setting is wrong.
+        """
         name = RECIPES.get(self.method, self.method)
         try:
             restarts = Recipe.load(name, list(self.settings)).restarts
@@ -75,11 +85,11 @@ class Run:
             raise RecipeError(f"method {self.method}: {error}") from None
 
     def order(self) -> np.ndarray:
-        """(F,) numbers of the frames in the order in which the trainer is given them."""
+        """Return the frame numbers (F,) in the order in which the trainer gets them."""
         return np.random.default_rng([self.seed, 0]).permutation(len(self.sequence.W))
 
     def folder(self, work: Path) -> Path:
-        """Where it is kept."""
+        """Return the experiment's folder in a work folder."""
         digest = hashlib.sha256(repr([__version__, *sorted(self.recipe().to_dict().items())]).encode())
         for array in (self.sequence.W.astype(np.float32), self.sequence.visible, self.order()):
             digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
@@ -89,9 +99,18 @@ class Run:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run gave: errors in %, codes (F,K) in the order of the sequence's frames or None, loss and seconds."""
+    """The result of an experiment.
 
-    run: Run
+    Attributes:
+        experiment: that gave it.
+        ne_flip_frame_percent: normalised error, depth flipped per frame.
+        ne_flip_global_percent: normalised error, one flip for all frames.
+        loss: of the training objective.
+        seconds: of training.
+        codes: (F,K) in the order of the sequence's frames; None if no networks were trained.
+    """
+
+    experiment: Experiment
     ne_flip_frame_percent: float
     ne_flip_global_percent: float
     loss: float
@@ -100,8 +119,15 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Keeping:
-    """How runs are done and kept: a folder for them, whether to train all anew, CPU threads, no progress bar."""
+class SeriesOptions:
+    """Options of a series of experiments.
+
+    Attributes:
+        work: folder that keeps the experiments.
+        fresh: whether to train all anew.
+        threads: CPU threads.
+        quiet: whether to hide the progress bar.
+    """
 
     work: Path
     fresh: bool = False
@@ -109,67 +135,71 @@ class Keeping:
     quiet: bool = False
 
 
-def perform(runs: list[Run], keeping: Keeping) -> list[Outcome]:
-    """Train what is not there yet, one run after the other, and judge all.
+def perform(experiments: list[Experiment], options: SeriesOptions) -> list[Outcome]:
+    """Train the experiments that are not kept yet, one after the other, and judge all.
 
     Raises:
-        RecipeError: a recipe or a setting is none; before any training.
-        DataError: frames that cannot be trained on; before any training too.
-        TrainingError: a run failed.
+        RecipeError: a recipe or a setting is wrong; raised before any training.
+        DataError: a sequence cannot be trained on; raised before any training.
+        TrainingError: an experiment failed.
     """
-    for run in runs:
-        _check(run)
-    folders = [run.folder(keeping.work) for run in runs]
-    if keeping.fresh:
-        shutil.rmtree(keeping.work / _STARTS, ignore_errors=True)
-    torch.set_num_threads(keeping.threads)
+    for experiment in experiments:
+        _check(experiment)
+    folders = [experiment.folder(options.work) for experiment in experiments]
+    if options.fresh:
+        shutil.rmtree(options.work / _STARTS, ignore_errors=True)
+    torch.set_num_threads(options.threads)
     outcomes = []
-    # Into a log file, a line twice a minute.
+    # A log file gets two lines a minute.
     interval = 0.1 if sys.stderr.isatty() else 30.0
     layout = "{percentage:3.0f}%|{bar:20}| {n:.2f} of {total} runs [{elapsed}, {remaining} left] {desc}"
     with tqdm(
-        total=len(runs), disable=keeping.quiet, bar_format=layout, mininterval=interval, dynamic_ncols=True
+        total=len(experiments), disable=options.quiet, bar_format=layout, mininterval=interval, dynamic_ncols=True
     ) as bar:
-        for number, (run, folder) in enumerate(zip(runs, folders)):
-            detail = f" {run.detail}" if run.detail else ""
-            bar.set_description_str(f"{run.sequence.name} {Path(run.method).stem}{detail} seed {run.seed}")
-            outcomes.append(_perform(run, folder, keeping.fresh, lambda done: _move(bar, number + done)))
+        for number, (experiment, folder) in enumerate(zip(experiments, folders)):
+            detail = f" {experiment.detail}" if experiment.detail else ""
+            name = f"{experiment.sequence.name} {Path(experiment.method).stem}{detail}"
+            bar.set_description_str(f"{name} seed {experiment.seed}")
+            outcomes.append(_perform(experiment, folder, options.fresh, lambda done: _move(bar, number + done)))
             _move(bar, number + 1)
     return outcomes
 
 
-def _check(run: Run) -> None:
-    """Refuse frames that the trainer would leave out: then shapes and truth were no longer of the same frames."""
-    enough = enough_visible(run.sequence.visible, anonymous_layout(run.sequence.W.shape[2]))
+def _check(experiment: Experiment) -> None:
+    """Refuse frames that the trainer would leave out, since shapes and truth must be of the same frames."""
+    sequence = experiment.sequence
+    enough = enough_visible(sequence.visible, anonymous_layout(sequence.W.shape[2]))
     if not enough.all():
         raise DataError(
-            f"{(~enough).sum()} of {len(enough)} frames of '{run.sequence.name}' show too few points to be "
-            "reconstructed: hide fewer points, or take these frames out of the file"
+            f"{(~enough).sum()} of {len(enough)} frames of '{sequence.name}' show too few points to be "
+            "reconstructed: hide fewer points, or remove these frames from the file"
         )
 
 
 def _move(bar: tqdm, to: float) -> None:
+    """Advance a bar to a count; it never goes back."""
     bar.update(max(0.0, to - bar.n))
 
 
-def _perform(run: Run, folder: Path, fresh: bool, progress: Callable[[float], None]) -> Outcome:
+def _perform(experiment: Experiment, folder: Path, fresh: bool, progress: Callable[[float], None]) -> Outcome:
+    """Train an experiment unless its reconstruction is kept, and judge it."""
     kept = folder / "shapes.npz"
     if fresh:
         shutil.rmtree(folder, ignore_errors=True)
     if not kept.exists():
-        data, recipe = _given(run, folder), run.recipe()
-        starts = _starts(data, recipe, folder)
+        data, recipe = _training_data(experiment, folder), experiment.recipe()
+        starts = _start_files(data, recipe, folder)
         for shared, own in starts:
-            _copied(shared, own)
+            _copy_if_missing(shared, own)
         found = reconstruction.reconstruct(data, recipe, folder / "run", progress)
         for shared, own in starts:
-            _copied(own, shared)
+            _copy_if_missing(own, shared)
         found.save(kept)
-    return _judged(run, reconstruction.load_reconstruction(kept))
+    return _judge(experiment, reconstruction.load_reconstruction(kept))
 
 
-def _starts(data: TrainingData, recipe: Recipe, folder: Path) -> list[tuple[Path, Path]]:
-    """Where a run's starts are kept for all runs, and where for itself."""
+def _start_files(data: TrainingData, recipe: Recipe, folder: Path) -> list[tuple[Path, Path]]:
+    """Return the shared and the own file of each of an experiment's starts."""
     pairs = []
     for one in reconstruction.restarts(recipe) if recipe.start != "random" else ():
         identity = json.dumps([__version__, start_identity(data, one)], sort_keys=True)
@@ -178,14 +208,14 @@ def _starts(data: TrainingData, recipe: Recipe, folder: Path) -> list[tuple[Path
     return pairs
 
 
-def _copied(source: Path, to: Path) -> None:
+def _copy_if_missing(source: Path, to: Path) -> None:
     if source.exists() and not to.exists():
         write_atomically(to, source.read_bytes())
 
 
-def _given(run: Run, folder: Path) -> TrainingData:
-    """The trainer's data: through a file that holds what the trainer may know and nothing else."""
-    order, sequence = run.order(), run.sequence
+def _training_data(experiment: Experiment, folder: Path) -> TrainingData:
+    """Return the trainer's data, read from a file that holds W and visible only."""
+    order, sequence = experiment.order(), experiment.sequence
     path = folder / "given.npz"
     buffer = io.BytesIO()
     np.savez(buffer, W=sequence.W[order].astype(np.float32), visible=sequence.visible[order])
@@ -194,21 +224,23 @@ def _given(run: Run, folder: Path) -> TrainingData:
     if data.left_out:
         raise DataError(
             f"{data.left_out} of {len(order)} frames of '{sequence.name}' have all points in one place: "
-            "take them out of the file"
+            "remove them from the file"
         )
     return data
 
 
-def _judged(run: Run, found: Reconstruction) -> Outcome:
-    """Errors of a reconstruction whose frames are in the run's order."""
-    order, sequence = run.order(), run.sequence
+def _judge(experiment: Experiment, found: Reconstruction) -> Outcome:
+    """Judge a reconstruction whose frames are in the experiment's order."""
+    order, sequence = experiment.order(), experiment.sequence
     if found.shapes.shape != sequence.S.shape:
-        raise DataError(f"the kept run of '{sequence.name}' has shapes {found.shapes.shape}: start over with --fresh")
+        raise DataError(
+            f"the kept run of '{sequence.name}' has shapes {found.shapes.shape}: train it anew with --fresh"
+        )
     back = order.argsort()
-    known = np.flatnonzero(sequence.present.sum(1) >= LEAST_VISIBLE)
+    known = np.flatnonzero(sequence.present.sum(1) >= MIN_POINTS)
     signs = errors_of_signs(found.shapes[back], sequence, known)
     return Outcome(
-        run,
+        experiment,
         float(100 * signs.min(1).mean()),
         float(100 * signs.mean(0).min()),
         float(found.loss),
@@ -218,27 +250,43 @@ def _judged(run: Run, found: Reconstruction) -> Outcome:
 
 
 def chosen(outcomes: list[Outcome]) -> Outcome:
-    """The one with the lowest loss: what can be chosen without a truth. All of one method, sequence and setting."""
-    return min(outcomes, key=lambda outcome: (outcome.loss, outcome.run.seed))
+    """Return the outcome with the lowest loss, a choice that needs no truth.
+
+    Args:
+        outcomes: of one method, sequence and setting.
+    """
+    return min(outcomes, key=lambda outcome: (outcome.loss, outcome.experiment.seed))
 
 
-def groups(outcomes: list[Outcome], key: Callable[[Outcome], object]) -> dict:
-    """Outcomes by key, in the order in which keys come."""
-    found: dict = {}
-    for outcome in outcomes:
-        found.setdefault(key(outcome), []).append(outcome)
+def groups(items: Iterable[Item], key: Callable[[Item], Hashable]) -> dict[Any, list[Item]]:
+    """Group items by key, in the order in which keys first occur."""
+    found: dict[Any, list[Item]] = {}
+    for item in items:
+        found.setdefault(key(item), []).append(item)
     return found
 
 
-def summary(outcomes: list[Outcome]) -> dict:
-    """What several seeds of one method, sequence and setting gave; deviation is the standard one over runs."""
+def outcome_row(outcome: Outcome, is_chosen: bool) -> dict[str, Any]:
+    """Return the keys that every report has for an outcome."""
+    return {
+        "seed": outcome.experiment.seed,
+        "ne_flip_frame_percent": outcome.ne_flip_frame_percent,
+        "ne_flip_global_percent": outcome.ne_flip_global_percent,
+        "loss": outcome.loss,
+        "seconds": outcome.seconds,
+        "chosen": is_chosen,
+    }
+
+
+def summary(outcomes: list[Outcome]) -> dict[str, Any]:
+    """Summarise the seeds of one method, sequence and setting; ``deviation`` is the standard deviation over them."""
     frame, whole = (
         np.array([getattr(outcome, f"ne_flip_{flip}_percent") for outcome in outcomes]) for flip in ("frame", "global")
     )
     pick = chosen(outcomes)
     return {
         "runs": len(outcomes),
-        "chosen_seed": pick.run.seed,
+        "chosen_seed": pick.experiment.seed,
         **{
             f"{name}_ne_flip_{flip}_percent": float(value)
             for name, *values in (

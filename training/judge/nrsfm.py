@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`paul benchmark nrsfm`: the paper's table of normalised errors, measured, beside the published one."""
+"""`paul benchmark nrsfm`: the paper's table of normalised errors, measured and published."""
 
 from __future__ import annotations
 
@@ -11,8 +11,18 @@ import numpy as np
 
 from paul_ros.versions import versions
 from training.errors import DataError
-from training.judge.experiments import BAD_BASIN, Keeping, Outcome, Run, chosen, groups, perform, summary
-from training.judge.pictures import legend_above, method_look, new_figure, percent_axis, save_figure, titled
+from training.judge.experiments import (
+    BAD_BASIN,
+    Experiment,
+    Outcome,
+    SeriesOptions,
+    chosen,
+    groups,
+    outcome_row,
+    perform,
+    summary,
+)
+from training.judge.pictures import legend_above, method_style, new_figure, percent_axis, save_figure, titled
 from training.judge.published import REMARK, SOURCE, published
 from training.judge.truth import Sequence, load_sequence
 
@@ -20,23 +30,27 @@ METHODS = ("paul", "adl", "adl_low_rank", "linear", "rigid")
 
 _RIVAL_MARKERS = {"CNS": "s", "PND": "^", "BMM": "v", "BMM-v2": "D", "Deep NRSfM": "*"}
 
-_STARTS = ("linear", "rigid")
-_TRAINING = ("start", "regression_steps", "steps")
-"""Settings that would make something else of a start that is a method of its own."""
+_START_METHODS = ("linear", "rigid")
+"""Methods that are a start alone."""
+
+_TRAINING_SETTINGS = ("start", "regression_steps", "steps")
+"""Settings that start methods ignore, because these would turn them into other methods."""
 
 
 def find_sequences(folder: Path, names: list[str] | None = None) -> list[Sequence]:
-    """The npz files of a folder that hold W and S, all or the named ones; others are told of on stderr.
+    """Read the sequences of a folder: npz files with W and S, all or the named ones.
+
+    Without names, files that cannot be used are named on stderr and skipped.
 
     Raises:
-        DataError: no such folder, no such sequence, or none at all.
+        DataError: the folder or a named sequence is missing or cannot be used, or there is no sequence.
     """
     files = {path.stem: path for path in sorted(folder.glob("*.npz"))}
     if not files:
         raise DataError(f"no npz files in '{folder}': name a folder of sequences with W and S")
     missing = [name for name in names or () if name not in files]
     if missing:
-        raise DataError(f"no sequence {', '.join(missing)} in '{folder}'; there are {', '.join(files)}")
+        raise DataError(f"no sequence {', '.join(missing)} in '{folder}'; it holds {', '.join(files)}")
     if names:
         return [load_sequence(files[name]) for name in names]
     found = []
@@ -44,16 +58,18 @@ def find_sequences(folder: Path, names: list[str] | None = None) -> list[Sequenc
         try:
             found.append(load_sequence(path))
         except DataError as error:
-            print(f"left out: {error}", file=sys.stderr)
+            print(f"skipped: {error}", file=sys.stderr)
     if not found:
         raise DataError(f"no npz file in '{folder}' has both W and the truth S")
     return found
 
 
-def plan(sequences: list[Sequence], methods: list[str], seeds: int, hide: float, settings: list[str]) -> list[Run]:
-    """All runs, sequence by sequence; each seed hides other points."""
+def plan(
+    sequences: list[Sequence], methods: list[str], seeds: int, hide: float, settings: list[str]
+) -> list[Experiment]:
+    """Plan all experiments, sequence by sequence; each seed hides other points."""
     return [
-        Run(sequence.hiding(hide, seed) if hide else sequence, method, seed, _fitting(method, settings))
+        Experiment(sequence.hiding(hide, seed) if hide else sequence, method, seed, _fitting(method, settings))
         for sequence in sequences
         for method in methods
         for seed in range(seeds)
@@ -61,16 +77,17 @@ def plan(sequences: list[Sequence], methods: list[str], seeds: int, hide: float,
 
 
 def _fitting(method: str, settings: list[str]) -> tuple[str, ...]:
-    """The overrides under which a method still is what its name says."""
-    refused = _TRAINING if method in _STARTS else ()
+    """Return the overrides that apply to a method."""
+    refused = _TRAINING_SETTINGS if method in _START_METHODS else ()
     return tuple(setting for setting in settings if setting.partition("=")[0].strip() not in refused)
 
 
-def _tell_of_left_out(methods: list[str], settings: list[str]) -> None:
+def _print_ignored(methods: list[str], settings: list[str]) -> None:
+    """Name the overrides that methods ignore, on stderr."""
     for method in methods:
         fitting = _fitting(method, settings)
-        if left_out := [setting for setting in settings if setting not in fitting]:
-            print(f"{method}: {', '.join(left_out)} left out, for it is the start alone", file=sys.stderr)
+        if ignored := [setting for setting in settings if setting not in fitting]:
+            print(f"{method}: {', '.join(ignored)} ignored, because the method is the start alone", file=sys.stderr)
 
 
 def run(
@@ -81,23 +98,38 @@ def run(
     seeds: int,
     hide: float,
     settings: list[str],
-    keeping: Keeping,
-) -> dict:
-    """Train what is not there yet, and judge; the report is what `--json` writes.
+    options: SeriesOptions,
+) -> dict[str, Any]:
+    """Train the experiments that are not kept yet, and judge all.
 
-    Raises: see ``find_sequences`` and ``training.judge.experiments.perform``.
+    Args:
+        folder: of npz files.
+        sequences: names of files to use; None uses all.
+        methods: names or recipes.
+        seeds: number of seeds.
+        hide: share of every frame's points to hide.
+        settings: overrides of recipes, as for ``--set``.
+        options: of the experiments.
+
+    Returns:
+        The report of `--json`.
+
+    Raises:
+        DataError: a sequence is missing or cannot be used.
+        RecipeError: a recipe or a setting is wrong.
+        TrainingError: an experiment failed.
     """
     found = find_sequences(folder, sequences)
-    _tell_of_left_out(methods, settings)
-    outcomes = perform(plan(found, methods, seeds, hide, settings), keeping)
+    _print_ignored(methods, settings)
+    outcomes = perform(plan(found, methods, seeds, hide, settings), options)
     return report(outcomes) | {"hidden_share": hide, "settings": settings, "versions": versions()}
 
 
-def report(outcomes: list[Outcome]) -> dict:
-    """Rows of all runs, what they come down to, and what is published."""
-    series = groups(outcomes, lambda outcome: (outcome.run.sequence.name, outcome.run.method))
+def report(outcomes: list[Outcome]) -> dict[str, Any]:
+    """Return rows of all outcomes, their summary, and the published figures."""
+    series = groups(outcomes, lambda outcome: (outcome.experiment.sequence.name, outcome.experiment.method))
     picks = {id(chosen(some)) for some in series.values()}
-    names = dict.fromkeys(outcome.run.sequence.name for outcome in outcomes)
+    names = dict.fromkeys(outcome.experiment.sequence.name for outcome in outcomes)
     return {
         "rows": [_row(outcome, id(outcome) in picks) for outcome in outcomes],
         "summary": [{"sequence": key[0], "method": key[1], **summary(some)} for key, some in series.items()],
@@ -106,33 +138,29 @@ def report(outcomes: list[Outcome]) -> dict:
     }
 
 
-def _row(outcome: Outcome, is_chosen: bool) -> dict:
+def _row(outcome: Outcome, is_chosen: bool) -> dict[str, Any]:
+    experiment = outcome.experiment
     return {
-        "sequence": outcome.run.sequence.name,
-        "method": outcome.run.method,
-        "seed": outcome.run.seed,
-        "ne_flip_frame_percent": outcome.ne_flip_frame_percent,
-        "ne_flip_global_percent": outcome.ne_flip_global_percent,
-        "loss": outcome.loss,
-        "seconds": outcome.seconds,
-        "chosen": is_chosen,
+        "sequence": experiment.sequence.name,
+        "method": experiment.method,
+        **outcome_row(outcome, is_chosen),
     }
 
 
 _COLUMNS = ("chosen", "median", "best", "worst")
 
 
-def table(report: dict) -> str:
-    """The paper's table and ours, sequence by sequence."""
+def table(report: dict[str, Any]) -> str:
+    """Format measured and published errors, sequence by sequence."""
     head = (
         f"{'sequence':<12} {'method':<14}" + "".join(f"{name:>17}" for name in _COLUMNS) + f"{'bad':>8}{'seconds':>9}"
     )
     hidden = f", {report['hidden_share']:.0%} of the points hidden" if report.get("hidden_share") else ""
     lines = [f"normalised error in %, depth flip per frame / one flip for all{hidden}", head]
-    last = None
+    last = ""
     for row in report["summary"]:
         name = row["sequence"]
-        if last is not None and name != last:
+        if last and name != last:
             lines += _published_lines(report, last)
         lines.append(f"{name if name != last else '':<12} {Path(row['method']).stem:<14}" + _cells(row))
         last = name
@@ -140,14 +168,15 @@ def table(report: dict) -> str:
     return "\n".join(
         [
             *lines,
-            "chosen: the seed with the lowest loss, no truth looked at; bad: runs whose NE with one flip is above "
+            "chosen: the seed with the lowest loss, a choice without truth; bad: runs whose NE with one flip is above "
             f"{BAD_BASIN:g} times the median",
             f"published: {report['published_source']}; {REMARK}",
         ]
     )
 
 
-def _cells(row: dict) -> str:
+def _cells(row: dict[str, Any]) -> str:
+    """Format the errors of one line."""
     pairs = (
         f"{row[f'{name}_ne_flip_frame_percent']:>8.2f} /{row[f'{name}_ne_flip_global_percent']:>7.2f}"
         for name in _COLUMNS
@@ -156,17 +185,22 @@ def _cells(row: dict) -> str:
     return "".join(pairs) + f"{bad:>8}{row['seconds_median']:>9.0f}"
 
 
-def _published_lines(report: dict, name: str) -> list[str]:
+def _published_lines(report: dict[str, Any], name: str) -> list[str]:
+    """Return the lines after a sequence: its published figures and an empty line."""
     figures = report["published_ne_percent"].get(name)
     if not figures:
         return [""]
     return [f"{'':<13}published: " + ", ".join(f"{method} {value:.2f}" for method, value in figures.items()), ""]
 
 
-def write_picture(path: Path, report: dict) -> None:
-    """A dot a run, filled the chosen one, a bar at the median; black lines are the paper's PAUL, grey marks its rivals.
+def write_picture(path: Path, report: dict[str, Any]) -> None:
+    """Draw every run as a dot, the chosen one filled, with a bar at the median.
 
-    Raises ImportError without matplotlib, PictureError for an odd suffix.
+    Black lines are the published figures of PAUL, grey marks those of other methods.
+
+    Raises:
+        MissingPackageError: matplotlib is not installed.
+        PictureError: matplotlib cannot write the format of the suffix.
     """
     names = list(report["published_ne_percent"])
     methods = list(dict.fromkeys(row["method"] for row in report["rows"]))
@@ -188,8 +222,9 @@ def write_picture(path: Path, report: dict) -> None:
     save_figure(figure, path)
 
 
-def _draw_runs(ax: Any, x: float, half: float, rows: list[dict], method: str) -> None:
-    name, colour = method_look(method)
+def _draw_runs(ax: Any, x: float, half: float, rows: list[dict[str, Any]], method: str) -> None:
+    """Draw the runs of one method on one sequence."""
+    name, colour = method_style(method)
     errors = np.array([row["ne_flip_frame_percent"] for row in rows])
     face = [colour if row["chosen"] else "white" for row in rows]
     ax.hlines(np.median(errors), x - half, x + half, color=colour, linewidth=2.5, label=name)
@@ -198,10 +233,13 @@ def _draw_runs(ax: Any, x: float, half: float, rows: list[dict], method: str) ->
 
 
 def _draw_published(ax: Any, middle: int, figures: dict[str, float]) -> None:
+    """Draw the published figures of one sequence."""
     for name, value in figures.items():
         if name == "PAUL":
-            line = dict(color="black", linewidth=1, label="PAUL, published", zorder=1)
-            ax.hlines(value, middle - 0.42, middle + 0.42, **line)
+            span = middle - 0.42, middle + 0.42
+            ax.hlines(value, *span, color="black", linewidth=1, label="PAUL, published", zorder=1)
         else:
-            mark = dict(marker=_RIVAL_MARKERS[name], s=22, facecolors="none", edgecolors="#707070", linewidths=1)
+            mark: dict[str, Any] = dict(
+                marker=_RIVAL_MARKERS[name], s=22, facecolors="none", edgecolors="#707070", linewidths=1
+            )
             ax.scatter(middle + 0.44, value, label=name, **mark)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures that others have published, to print beside measured ones."""
+"""Published normalised errors, printed beside measured ones."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ PAUL           0.47   2.03  1.71    1.62 10.22  0.37  4.97  4.38  0.39  0.77  0.
 
 SOURCE = "Wang and Lucey, PAUL: Procrustean Autoencoder for Unsupervised Lifting, CVPR 2021, table 1"
 
-REMARK = "CNS and BMM-v2 use the order of the frames; the long sequences' cameras are random and not public"
+REMARK = "CNS and BMM-v2 use the order of the frames; the cameras of the long sequences are random and not public"
 
 
 def _parse(text: str) -> dict[str, dict[str, float]]:
+    """Parse a table with a column a sequence and a row a method to sequence -> method -> figure."""
     head, *lines = text.strip().splitlines()
     cells = [line.split() for line in lines]
     return {
@@ -28,13 +29,14 @@ def _parse(text: str) -> dict[str, dict[str, float]]:
 
 
 NORMALISED_ERROR_PERCENT = _parse(_PAUL_TABLE_1)
-"""Normalised error in % by sequence and method."""
+"""Sequence -> method -> normalised error in %."""
 
 
 def published(sequence: str) -> dict[str, float]:
-    """Normalised errors in % by method of a sequence; empty where none is known.
+    """Return method -> normalised error in % of a sequence; empty if none is published.
 
-    A file of all or of the training frames carries the sequence's name: ``drink``, ``S5_train``.
+    Args:
+        sequence: its name, with or without the suffix ``_train``: ``drink``, ``S5_train``.
     """
     name = sequence.removesuffix("_train").lower()
     known = {key.lower(): figures for key, figures in NORMALISED_ERROR_PERCENT.items()}

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Made-up dense data: a body of bones with smooth skin, as many points and frames as are wanted, random cameras.
+"""Synthetic dense data: a body of bones with smooth skin under random cameras, with any number of points and frames.
 
-``python -m training.judge.synthetic -o mesh.npz --points 6890 --frames 5000`` writes a file that ``paul train`` takes.
+    python -m training.judge.synthetic -o mesh.npz [--points 6890] [--frames 5000] [--seed 0] [--truth]
+
+The file holds W (F,2,P) and edges (E,2), for ``paul train``; with --truth also S (F,3,P), for ``paul evaluate``.
 """
 
 from __future__ import annotations
@@ -10,13 +12,16 @@ import argparse
 import io
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from paul_ros.files import write_atomically
 
+_Bone = tuple[int, tuple[float, float, float], tuple[float, float, float], float]
+
 #: Bones of a body two units tall, y up: parent, start, end and radius.
-_BONES = (
+_BONES: tuple[_Bone, ...] = (
     (-1, (0.0, 0.0, 0.0), (0.0, 0.5, 0.0), 0.16),  # trunk
     (0, (0.0, 0.55, 0.0), (0.0, 0.8, 0.0), 0.11),  # head
     (0, (0.2, 0.5, 0.0), (0.5, 0.5, 0.0), 0.06),  # left arm
@@ -29,20 +34,27 @@ _BONES = (
     (8, (-0.12, -0.45, 0.0), (-0.13, -0.9, 0.03), 0.055),
 )
 _MOTIONS = 6
-"""Ways in which the body moves, each bending all joints at once."""
+"""Degrees of freedom of the poses; each bends all joints at once."""
 
 _BEND = 0.35
-"""Radians, standard deviation of a joint's rotation vector."""
+"""Standard deviation of a joint's rotation vector, radians."""
 
 _BLOCK = 256
 _GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 
 
 def articulated_mesh(points: int, frames: int, seed: int = 0) -> np.ndarray:
-    """Points (F,3,P) of the moving body in the camera frame, float32, centred; W is their first two rows.
+    """Return the moving body's points by linear blend skinning; equal arguments give equal points.
 
-    Smooth (linear blend) skinning; poses of ``_MOTIONS`` degrees of freedom; rotations uniform over SO(3).  The same
-    for the same arguments.
+    Poses have ``_MOTIONS`` degrees of freedom, camera rotations are uniform over SO(3).
+
+    Args:
+        points: number of points P.
+        frames: number of frames F.
+        seed: of poses and cameras.
+
+    Returns:
+        (F,3,P) float32 in the camera frame, centred; the first two rows are the orthographic image W.
     """
     rng = np.random.default_rng(seed)
     skin = _skin(points)
@@ -58,9 +70,9 @@ def articulated_mesh(points: int, frames: int, seed: int = 0) -> np.ndarray:
 
 
 def mesh_edges(points: int, neighbours: int = 3) -> np.ndarray:
-    """Edges (E,2) from each point of the body at rest to its nearest ones, each once, sorted."""
+    """Return edges (E,2) from each point of the body at rest to its nearest ones, each once, sorted."""
     rest = _surface(points)
-    pairs = set()
+    pairs: set[tuple[int, int]] = set()
     for rows in _blocks(points):
         distance = ((rest[rows, None] - rest[None]) ** 2).sum(2)
         distance[np.arange(len(distance)), np.arange(points)[rows]] = np.inf
@@ -70,13 +82,15 @@ def mesh_edges(points: int, neighbours: int = 3) -> np.ndarray:
 
 
 def _surface(points: int) -> np.ndarray:
-    """Points (P,3) of the body at rest, evenly over the bones' surfaces, on a spiral around each."""
+    """Return points (P,3) of the body at rest, evenly spread on spirals around the bones."""
     area = np.array([np.linalg.norm(np.subtract(end, start)) * radius for _, start, end, radius in _BONES])
     last = np.round(np.cumsum(area) / area.sum() * points).astype(int)
-    return np.concatenate([_tube(*bone[1:], count) for bone, count in zip(_BONES, np.diff(last, prepend=0))])
+    counts = np.diff(last, prepend=0)
+    return np.concatenate([_tube(*bone[1:], count) for bone, count in zip(_BONES, counts.tolist())])
 
 
-def _tube(start: tuple, end: tuple, radius: float, count: int) -> np.ndarray:
+def _tube(start: tuple[float, float, float], end: tuple[float, float, float], radius: float, count: int) -> np.ndarray:
+    """Return so many points (N,3) on a spiral around a bone."""
     axis = np.subtract(end, start)
     side = np.cross(axis, (0.0, 0.0, 1.0))
     side /= np.linalg.norm(side)
@@ -87,7 +101,10 @@ def _tube(start: tuple, end: tuple, radius: float, count: int) -> np.ndarray:
 
 
 def _skin(points: int) -> np.ndarray:
-    """(P,4B): times the stacked 4 x 3 motions of the B bones it gives the posed points; nearer bones weigh more."""
+    """Return the skinning matrix (P,4B), in which nearer bones weigh more.
+
+    Its product with the stacked 4 x 3 motions of the B bones is the posed points.
+    """
     rest = _surface(points)
     distance = np.stack([_distance(rest, np.array(start), np.array(end)) for _, start, end, _ in _BONES], axis=1)
     weight = np.exp(-((distance / 0.08) ** 2)) + 1e-12
@@ -97,14 +114,14 @@ def _skin(points: int) -> np.ndarray:
 
 
 def _distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distances (P,) of points (P,3) from a line segment."""
+    """Return the distances (P,) of points (P,3) from a line segment."""
     axis = end - start
     along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
     return np.linalg.norm(points - start - along[:, None] * axis, axis=1)
 
 
 def _bone_motions(angles: np.ndarray) -> np.ndarray:
-    """(N,B,4,3): what each bone does to homogeneous row vectors at rest, given rotation vectors (N,B,3) of joints."""
+    """Return the bones' motions (N,B,4,3) of homogeneous row vectors at rest, from rotation vectors (N,B,3)."""
     size = np.linalg.norm(angles, axis=2, keepdims=True)
     half = np.concatenate([np.cos(size / 2), np.sinc(size / (2 * np.pi)) / 2 * angles], axis=2)
     turn = _rotations(half.reshape(-1, 4)).reshape(*angles.shape[:2], 3, 3)
@@ -120,7 +137,7 @@ def _bone_motions(angles: np.ndarray) -> np.ndarray:
 
 
 def _rotations(quaternion: np.ndarray) -> np.ndarray:
-    """Rotations (N,3,3) of quaternions (N,4), w first, of any length; of Gaussian ones they are uniform."""
+    """Return rotations (N,3,3) of quaternions (N,4), w first, of any length; Gaussian ones give uniform rotations."""
     w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -131,21 +148,29 @@ def _rotations(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _blocks(count: int) -> Iterator[slice]:
+    """Yield slices of frames or points that fit into memory."""
     return (slice(begin, min(begin + _BLOCK, count)) for begin in range(0, count, _BLOCK))
 
 
 def main() -> None:
-    """Write a file to train on; the 3D truth only where it is asked for."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--points", type=int, default=6890)
-    parser.add_argument("--frames", type=int, default=5000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--truth", action="store_true", help="write S (F,3,P) too")
+    """Run the command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.judge.synthetic",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="file to write (.npz)")
+    parser.add_argument("--points", type=int, default=6890, help="number of points (default: %(default)s)")
+    parser.add_argument("--frames", type=int, default=5000, help="number of frames (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of poses and cameras (default: %(default)s)")
+    parser.add_argument("--truth", action="store_true", help="write the truth S as well")
     args = parser.parse_args()
     S = articulated_mesh(args.points, args.frames, args.seed)
+    arrays: dict[str, Any] = {"W": S[:, :2], "edges": mesh_edges(args.points)}
+    if args.truth:
+        arrays["S"] = S
     buffer = io.BytesIO()
-    np.savez(buffer, W=S[:, :2], edges=mesh_edges(args.points), **({"S": S} if args.truth else {}))
+    np.savez(buffer, **arrays)
     write_atomically(args.output, buffer.getvalue())
 
 

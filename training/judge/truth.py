@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""2D keypoints beside their 3D truth: what is judged with, and what the trainer never sees."""
+"""2D keypoints with their 3D truth, for evaluation; the trainer never reads the truth."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from training.errors import DataError
 
 @dataclass(frozen=True)
 class Sequence:
-    """F frames of P points; frames may come in any order, the trainer is given them shuffled.
+    """F frames of P points in any order; the trainer gets them shuffled.
 
     Attributes:
         name: file name without suffix.
         W: (F,2,P) image points, float32 or float64, y down; 0 where hidden.
         visible: (F,P) bool.
-        S: (F,3,P) truth in the camera frame and the unit of W, float32 or float64; NaN where it is not known.
-        edges: (E,2) points to draw lines between, may be empty. For pictures only.
-        metres: S is in metres.
+        S: (F,3,P) truth in the camera frame and the unit of W, float32 or float64; NaN where it is unknown.
+        edges: (E,2) points that pictures join by lines; may be empty.
+        metres: whether S is in metres.
     """
 
     name: str
@@ -35,11 +35,11 @@ class Sequence:
 
     @property
     def present(self) -> np.ndarray:
-        """(F,P) bool: the truth of the point is known."""
+        """Mask (F,P) of the points with a known truth."""
         return np.isfinite(self.S).all(1)
 
     def hiding(self, share: float, seed: int) -> Sequence:
-        """The same with that share of every frame's points hidden at random, one number of points in every frame."""
+        """Return a copy with this share of every frame's visible points hidden at random."""
         drawn = np.where(self.visible, np.random.default_rng([seed, 1]).random(self.visible.shape), 2.0)
         order = drawn.argsort(1).argsort(1)
         count = np.round(share * self.visible.sum(1)).astype(int)
@@ -47,7 +47,7 @@ class Sequence:
         return replace(self, visible=visible, W=np.where(visible[:, None], self.W, 0.0))
 
     def noisy(self, share: float, seed: int) -> Sequence:
-        """The same with Gaussian noise on W, its deviation that share of the rms coordinate; the truth stays clean."""
+        """Return a copy with Gaussian noise on W only; its deviation is this share of the rms coordinate."""
         seen = self.visible[:, None]
         count = np.maximum(self.visible.sum(1), 1)[:, None, None]
         offset = np.where(seen, self.W - self.W.sum(2, keepdims=True) / count, 0.0)
@@ -56,19 +56,19 @@ class Sequence:
         return replace(self, W=np.where(seen, self.W + share * rms * noise, 0.0))
 
     def from_random_cameras(self, seed: int) -> Sequence:
-        """The same shapes, each seen by an orthographic camera of its own random rotation; needs the whole truth.
+        """Return the same shapes, each seen by an orthographic camera with a random rotation of its own.
 
         Raises:
-            DataError: the truth of some points is not known.
+            DataError: the truth of some points is unknown.
         """
         if not self.present.all():
-            raise DataError(f"'{self.name}' cannot be seen from other sides: the truth S of some points is not known")
+            raise DataError(f"'{self.name}' cannot be seen by other cameras: the truth S of some points is unknown")
         S = random_rotations(len(self.S), seed) @ (self.S - self.S.mean(2, keepdims=True))
         return replace(self, W=np.where(self.visible[:, None], S[:, :2], 0.0), S=S)
 
 
 def random_rotations(count: int, seed: int) -> np.ndarray:
-    """Rotations (count,3,3), det +1, uniform over all orientations."""
+    """Return rotations (count,3,3), det +1, uniform over all orientations."""
     Q, triangle = np.linalg.qr(np.random.default_rng([seed, 3]).standard_normal((count, 3, 3)))
     Q = Q * np.sign(np.diagonal(triangle, axis1=1, axis2=2))[:, None]
     Q[:, :, 0] *= np.linalg.det(Q)[:, None]
@@ -76,10 +76,10 @@ def random_rotations(count: int, seed: int) -> np.ndarray:
 
 
 def load_sequence(path: str | Path) -> Sequence:
-    """Read an npz with W (F,2,P) and the truth S (F,3,P), and optionally visible (F,P), edges (E,2), metres (one bool).
+    """Read an npz with W (F,2,P), the truth S (F,3,P) and, optionally, visible (F,P), edges (E,2), metres (one bool).
 
     Raises:
-        DataError: no such file, damage, a missing array, or arrays that do not fit together.
+        DataError: the file is missing or damaged, or an array is missing or does not fit the others.
     """
     path = Path(path)
     if not path.is_file():
@@ -87,7 +87,7 @@ def load_sequence(path: str | Path) -> Sequence:
     try:
         arrays = read_npz(path, ("W", "S"), ("visible", "edges", "metres"))
     except NpzError as error:
-        raise DataError(f"'{path}' {error} (judging needs W (F,2,P) and the truth S (F,3,P))") from error
+        raise DataError(f"'{path}' {error} (evaluation needs W (F,2,P) and the truth S (F,3,P))") from error
     for name, rows in (("W", 2), ("S", 3)):
         if arrays[name].ndim != 3 or arrays[name].shape[1] != rows or arrays[name].dtype.kind not in "fiu":
             raise DataError(
@@ -127,7 +127,7 @@ def _sequence(
 
 
 def _floating(array: np.ndarray) -> type:
-    """Single precision stays what it is: dense truth fills memory."""
+    """Return the array's floating type; float32 is kept because dense truth fills memory."""
     return np.float32 if array.dtype == np.float32 else np.float64
 
 

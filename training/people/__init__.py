@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""2D training views of people from motion capture: readers, cameras, a detector model. NumPy only."""
+"""2D training views of people, simulated from motion capture. NumPy only, no torch."""

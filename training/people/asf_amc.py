@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Acclaim skeletons (.asf) and motions (.amc), as the CMU archive has them, to CMU-31 joints. numpy only.
+"""Reader of the CMU archive's Acclaim skeletons (.asf) and motions (.amc); gives CMU-31 joints. NumPy only.
 
-The format (Acclaim ATG, Skeleton File Definition 1.10, 1995): a bone has a direction and a length in the world's axes
-at rest, and an axis, a rotation C; a motion gives it angles about the axes of that frame for its degrees of freedom.
-With M their rotation, the bone and all that hangs on it are turned by C M C^-1, and it ends at ``parent + length R
-direction``.  Rotations are about fixed axes in the order in which they are listed: for XYZ first x, so Rz Ry Rx.  No
-package that is kept up reads these files.
+The format is Acclaim ATG, Skeleton File Definition 1.10, 1995.  A bone at rest has a direction and a length in the
+world's axes, and an axis frame, a rotation C.  A motion gives angles about that frame's axes for the bone's degrees of
+freedom; M is their rotation.  C M C^-1 turns the bone and its descendants, and the bone ends at
+``parent + length R direction``.  Rotations are about fixed axes in the listed order: XYZ means first x, so Rz Ry Rx.
+
+No maintained package reads these files.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from training.errors import MocapError
-from training.people.mocap import CMU31, are_numbers, check_size, read_lines, rotation
+from training.people.mocap import CMU31, are_plausible, check_size, fixed_axis_rotations, read_lines
 
 INCH = 0.0254
-"""Metres: CMU's lengths, divided by the skeleton's unit of length, are inches (mocap.cs.cmu.edu, Frequently Asked)."""
+"""Metres.  CMU's lengths divided by the skeleton's unit of length are inches (mocap.cs.cmu.edu, Frequently Asked)."""
 
 _ROTATIONS = {"rx": 0, "ry": 1, "rz": 2}
 _ROOT_ORDER = ("tx", "ty", "tz", "rx", "ry", "rz")
@@ -27,7 +28,16 @@ _ROOT_ORDER = ("tx", "ty", "tz", "rx", "ry", "rz")
 
 @dataclass
 class Bone:
-    """A bone at rest. direction: (3,) of length 1. axis: (3,3) C. dof: axes that it turns about, 0 for x, in order."""
+    """A bone at rest.
+
+    Attributes:
+        name: of the bone.
+        parent: name of the parent bone, or ``root``.
+        direction: (3,) unit vector in the world's axes.
+        length: in the file's unit of length.
+        axis: (3,3) the rotation C of the bone's axis frame.
+        dof: axes of its rotations in their order; 0, 1, 2 for x, y, z.
+    """
 
     name: str
     parent: str = ""
@@ -38,11 +48,17 @@ class Bone:
 
 
 @dataclass(frozen=True)
-class Skeleton:
-    """An .asf file. bones: parents before children. metres: of its unit of length. degrees: else radians.
+class AsfSkeleton:
+    """The contents of an .asf file.
 
-    order: of the root's six values, indices of tx, ty, tz, rx, ry, rz. position: (3,) added to the root's.
-    axis: (3,3) C of the root.
+    Attributes:
+        path: of the file.
+        bones: parents before children.
+        metres: metres per unit of length.
+        degrees: whether angles are degrees; else radians.
+        order: order of the root's six values, as indices of tx, ty, tz, rx, ry, rz.
+        position: (3,) offset added to the root's position.
+        axis: (3,3) the rotation C of the root.
     """
 
     path: Path
@@ -54,17 +70,17 @@ class Skeleton:
     axis: np.ndarray
 
 
-def read_asf(path: Path) -> Skeleton:
+def read_asf(path: Path) -> AsfSkeleton:
     """Read a skeleton.
 
     Raises:
-        MocapError: it cannot be read, is no skeleton or not CMU's; with file, line and what is wrong.
+        MocapError: the file cannot be read, or is no skeleton of the CMU archive; names file and line.
     """
     return _AsfReader(path).skeleton()
 
 
 class _AsfReader:
-    """One pass over the lines, then what must be there is looked for."""
+    """Parser of an .asf file: one pass over the lines, then a check that nothing is missing."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.line = path, 0
@@ -82,10 +98,11 @@ class _AsfReader:
             elif reader := getattr(self, f"_{section[1:]}", None) if section in _SECTIONS else None:
                 reader([words[0].lower(), *words[1:]])
         if self._bone is not None:
-            raise self._wrong("the file ends within a bone: it is cut off, get it again")
+            raise self._error("the file ends within a bone: it is cut off, get it again")
 
-    def _wrong(self, what: str) -> MocapError:
-        return MocapError(f"{self.path}:{self.line}: {what}")
+    def _error(self, text: str) -> MocapError:
+        """Return an error at the current line."""
+        return MocapError(f"{self.path}:{self.line}: {text}")
 
     def _units(self, words: list[str]) -> None:
         self.units[words[0]] = " ".join(words[1:]).lower()
@@ -97,27 +114,28 @@ class _AsfReader:
         if words[0] == "begin":
             self._bone = {}
         elif self._bone is None:
-            raise self._wrong(f"'{words[0][:40]}' outside of a bone; a bone goes from begin to end")
+            raise self._error(f"'{words[0][:40]}' outside of a bone; a bone goes from begin to end")
         elif words[0] == "end":
-            bone = self._made(self._bone)
+            bone = self._parse_bone(self._bone)
             if bone.name in self.bones:
-                raise self._wrong(f"bone '{bone.name}' is there twice")
+                raise self._error(f"bone '{bone.name}' occurs twice")
             self.bones[bone.name], self._bone = bone, None
         else:
             self._bone[words[0]] = words[1:]
 
-    def _made(self, given: dict[str, list[str]]) -> Bone:
+    def _parse_bone(self, given: dict[str, list[str]]) -> Bone:
+        """Return the bone of the lines between begin and end, by their first words."""
         if missing := [key for key in ("name", "direction", "length", "axis") if not given.get(key)]:
-            raise self._wrong(f"the bone that ends here has no {missing[0]}")
+            raise self._error(f"the bone that ends here has no {missing[0]}")
         direction = self._numbers(given["direction"], 3, "direction")
         size = np.linalg.norm(direction)
         if not 0.9 < size < 1.1:
-            raise self._wrong(f"the direction of '{given['name'][0]}' has length {size:.3g}, not 1")
+            raise self._error(f"the direction of '{given['name'][0]}' has length {size:.3g}, not 1")
         dof = [word.lower() for word in given.get("dof", [])]
         if unknown := [word for word in dof if word not in _ROTATIONS]:
-            raise self._wrong(f"degree of freedom '{unknown[0]}': bones only turn (rx, ry, rz)")
+            raise self._error(f"degree of freedom '{unknown[0]}' is not supported, only rotations: rx, ry, rz")
         order = self._axes(given["axis"][3:], "axis")
-        axis = rotation(self._angles(given["axis"][:3], "axis")[None], order)[0]
+        axis = fixed_axis_rotations(self._angles(given["axis"][:3], "axis")[None], order)[0]
         length = self._numbers(given["length"], 1, "length")[0]
         return Bone(given["name"][0], "", direction / size, length, axis, tuple(_ROTATIONS[word] for word in dof))
 
@@ -126,34 +144,41 @@ class _AsfReader:
             return
         for child in words[1:]:
             if child not in self.bones or words[0] not in self.bones and words[0] != "root":
-                raise self._wrong(f"'{child}' under '{words[0]}': one of them is no bone")
+                raise self._error(f"'{child}' under '{words[0]}': one of them is no bone")
             if self.bones[child].parent:
-                raise self._wrong(f"bone '{child}' has two parents")
+                raise self._error(f"bone '{child}' has two parents")
             self.bones[child].parent = words[0]
 
     def _numbers(self, words: list[str], count: int, what: str) -> np.ndarray:
+        """Convert words to so many numbers."""
         try:
             numbers = np.array([float(word) for word in words])
         except ValueError:
             numbers = np.array([])
-        if len(numbers) != count or not are_numbers(numbers):
-            raise self._wrong(f"{what} must be {count} numbers, it is '{' '.join(words)[:40]}'")
+        if len(numbers) != count or not are_plausible(numbers):
+            raise self._error(f"{what} must be {count} numbers, it is '{' '.join(words)[:40]}'")
         return numbers
 
     def _angles(self, words: list[str], what: str) -> np.ndarray:
+        """Convert words to three angles in radians."""
         angles = self._numbers(words, 3, what)
         return angles if self.units.get("angle") == "rad" else np.deg2rad(angles)
 
     def _axes(self, words: list[str], what: str) -> tuple[int, ...]:
+        """Convert an order of axes, such as XYZ, to indices."""
         text = "".join(words).lower()
         if sorted(text) != ["x", "y", "z"]:
-            raise self._wrong(f"{what} must name its order, as XYZ, it is '{text[:40]}'")
+            raise self._error(f"{what} must name its order, as XYZ, it is '{text[:40]}'")
         return tuple("xyz".index(letter) for letter in text)
 
-    def skeleton(self) -> Skeleton:
-        """Raises MocapError where something needed is not in the file."""
+    def skeleton(self) -> AsfSkeleton:
+        """Return the skeleton.
+
+        Raises:
+            MocapError: a part of it is missing in the file.
+        """
         if missing := [name for name in CMU31[1:] if name not in self.bones]:
-            raise MocapError(f"{self.path}: no bone '{missing[0]}', this is no skeleton of the CMU archive")
+            raise MocapError(f"{self.path}: no bone '{missing[0]}', so this is no skeleton of the CMU archive")
         if self.units.get("angle") not in ("deg", "rad"):
             raise MocapError(f"{self.path}: ':units' must say 'angle deg' or 'angle rad'")
         unit = self._numbers(self.units.get("length", "").split(), 1, "length in ':units'")[0]
@@ -161,24 +186,24 @@ class _AsfReader:
         if sorted(order) != sorted(_ROOT_ORDER):
             raise MocapError(f"{self.path}: ':root' must have an order of {' '.join(_ROOT_ORDER)}")
         turn = self._angles(self.root.get("orientation", []), "orientation of ':root'")
-        return Skeleton(
+        return AsfSkeleton(
             self.path,
             self._sorted(),
             INCH / unit,
             self.units["angle"] == "deg",
             tuple(_ROOT_ORDER.index(word) for word in order),
             self._numbers(self.root.get("position", []), 3, "position of ':root'"),
-            rotation(turn[None], self._axes(self.root.get("axis", []), "axis of ':root'"))[0],
+            fixed_axis_rotations(turn[None], self._axes(self.root.get("axis", []), "axis of ':root'"))[0],
         )
 
     def _sorted(self) -> tuple[Bone, ...]:
-        """Parents before children."""
+        """Return the bones, parents before children."""
         done: dict[str, Bone] = {}
         while len(done) < len(self.bones):
             ready = [b for b in self.bones.values() if b.name not in done and (b.parent in done or b.parent == "root")]
             if not ready:
                 loose = next(name for name in self.bones if name not in done)
-                raise MocapError(f"{self.path}: bone '{loose}' hangs on nothing in ':hierarchy'")
+                raise MocapError(f"{self.path}: bone '{loose}' has no parent in ':hierarchy'")
             done |= {bone.name: bone for bone in ready}
         return tuple(done.values())
 
@@ -186,39 +211,46 @@ class _AsfReader:
 _SECTIONS = (":units", ":root", ":bonedata", ":hierarchy")
 
 
-def read_amc(path: Path, skeleton: Skeleton) -> np.ndarray:
-    """The joints of a motion, (F,31,3) float32 metres, y up, order CMU31.
+def read_amc(path: Path, skeleton: AsfSkeleton) -> np.ndarray:
+    """Read a motion.
+
+    Args:
+        path: of the .amc file.
+        skeleton: of the same person.
+
+    Returns:
+        (F,31,3) float32 joints in metres, y up, order ``CMU31``.
 
     Raises:
-        MocapError: it cannot be read, is cut off, or is none of this skeleton; with file, line and what is wrong.
+        MocapError: the file cannot be read, is cut off, or belongs to another skeleton; names file and line.
     """
     angles = _read_values(path, skeleton)
     root = np.empty_like(angles["root"])
     root[:, list(skeleton.order)] = angles["root"]
     turn = tuple(index - 3 for index in skeleton.order if index >= 3)
     ends = {"root": skeleton.position + root[:, :3]}
-    turns = {"root": skeleton.axis @ rotation(_radians(root[:, 3:], skeleton), turn) @ skeleton.axis.T}
+    turns = {"root": skeleton.axis @ fixed_axis_rotations(_radians(root[:, 3:], skeleton), turn) @ skeleton.axis.T}
     for bone in skeleton.bones:
         turned = turns[bone.parent]
         if bone.dof:
             given = np.zeros((len(root), 3))
             given[:, list(bone.dof)] = _radians(angles[bone.name], skeleton)
-            turned = turned @ bone.axis @ rotation(given, bone.dof) @ bone.axis.T
+            turned = turned @ bone.axis @ fixed_axis_rotations(given, bone.dof) @ bone.axis.T
         turns[bone.name] = turned
         ends[bone.name] = ends[bone.parent] + bone.length * (turned @ bone.direction)
     joints = skeleton.metres * np.stack([ends[name] for name in CMU31], axis=1)
     return check_size(path, joints).astype(np.float32)
 
 
-def _radians(values: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+def _radians(values: np.ndarray, skeleton: AsfSkeleton) -> np.ndarray:
     return np.deg2rad(values) if skeleton.degrees else values
 
 
-def _read_values(path: Path, skeleton: Skeleton) -> dict[str, np.ndarray]:
-    """For the root and every bone that moves, its values (F,D), as they stand in the file.
+def _read_values(path: Path, skeleton: AsfSkeleton) -> dict[str, np.ndarray]:
+    """Return the values (F,D) of the root and of every moving bone, as they stand in the file.
 
-    All frames list the same bones in the same order, so a bone is every B-th line: what else stands there is at fault.
-    Frames are numbered, and some numbers may be left out.
+    All frames must list the same bones in the same order, so that a bone is every B-th line.  Frames are numbered;
+    numbers may be left out.
     """
     lines, first = _frames(path)
     end = next((k for k, text in enumerate(lines[1:], 1) if text.strip().isdecimal()), len(lines))
@@ -244,7 +276,7 @@ def _read_values(path: Path, skeleton: Skeleton) -> dict[str, np.ndarray]:
 
 
 def _frames(path: Path) -> tuple[list[str], int]:
-    """The lines from the first frame on, and the number of the first of them."""
+    """Return the lines from the first frame on, and the line number of the first one."""
     lines = read_lines(path)
     while lines and not lines[-1].strip():
         lines.pop()
@@ -256,28 +288,32 @@ def _frames(path: Path) -> tuple[list[str], int]:
             raise MocapError(f"{path}:{index + 1}: '{words[0]}' is not supported, only :FULLY-SPECIFIED and :DEGREES")
         if words and not words[0].startswith(("#", ":")):
             break
-    raise MocapError(f"{path}: no frames: this is no .amc file")
+    raise MocapError(f"{path}: the file has no frames, so it is no .amc file")
 
 
 def _column(lines: list[str], name: str, count: int) -> np.ndarray:
-    """The values (F,D) of a bone's lines; ValueError where one of them is not the name and D numbers."""
+    """Return the values (F,D) of a bone's lines.
+
+    Raises:
+        ValueError: a line is not the bone's name followed by D numbers.
+    """
     words = [text.split() for text in lines]
     if any(len(line) != count + 1 or line[0] != name for line in words):
         raise ValueError(name)
     values = np.array([line[1:] for line in words], dtype=float)
-    if not are_numbers(values):
+    if not are_plausible(values):
         raise ValueError(name)
     return values
 
 
 def _check_lines(path: Path, lines: list[str], names: list[str], first: int, counts: dict[str, int]) -> None:
-    """Raise MocapError for the first line that is not as in frame 1; names[0] stands for the frame's number."""
+    """Raise MocapError for the first line that differs from frame 1; names[0] stands for the frame's number."""
     for index, text in enumerate(lines):
         number, words, expected = first + index, text.split(), names[index % len(names)]
         if not words or words[0] != expected and (expected or not text.strip().isdecimal()):
-            told = f"'{words[0][:40]}'" if words else "nothing"
+            found = f"'{words[0][:40]}'" if words else "nothing"
             wanted = f"'{expected}'" if expected else "its number"
-            raise MocapError(f"{path}:{number}: {told} where {wanted} of frame {index // len(names) + 1} belongs")
+            raise MocapError(f"{path}:{number}: {found} where {wanted} of frame {index // len(names) + 1} belongs")
         if expected in counts:
             try:
                 _column([text], expected, counts[expected])

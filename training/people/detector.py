@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An imperfect detector of keypoints: errors with heavy tails, exchanged sides, confidences, one layout's points.
+"""Model of an imperfect keypoint detector: heavy-tailed errors, left-right swaps, confidences, layouts. NumPy only.
 
-At level 1 errors are as those of a stacked-hourglass detector, measured on 58,000 images of people, in per cent of the
-person's height in the image: hips, thorax and shoulders have a median of 2.3-3.6, 90 % are below 6-9 and 99 % below
-22-26; elbows and knees 2.4-3.3, 9-13, 29-35; wrists and ankles 2.2-5.4, 13-14, 43-47.  Left and right are exchanged in
-0.5-0.7 % of limb pairs, of ankles in 1.25 %.  Annotation sets differ in where a point is: hips by 2 %, shoulders by
-1 %, heads by 7 % of the height.
+Errors of level 1 are those of a stacked-hourglass detector, measured on 58,000 images of people.  They are in per cent
+of the person's height in the image:
+
+| points | median | 90 % below | 99 % below |
+|---|---|---|---|
+| hips, thorax, shoulders | 2.3-3.6 | 6-9 | 22-26 |
+| elbows, knees | 2.4-3.3 | 9-13 | 29-35 |
+| wrists, ankles | 2.2-5.4 | 13-14 | 43-47 |
+
+Left and right are swapped in 0.5-0.7 % of limb pairs, for ankles in 1.25 %.  Annotation sets differ in the definition
+of points: hips by 2 %, shoulders by 1 %, heads by 7 % of the height.
 """
 
 from __future__ import annotations
@@ -15,15 +21,15 @@ from functools import cache
 
 import numpy as np
 
-from training.people.mocap import human_layout, human_mapping
-from training.people.view_settings import COMPLETE, Views
+from training.people.human_points import human_layout, human_mapping
+from training.people.view_settings import COMPLETE, ViewSettings
 
-# Mixtures of three Gaussians: shares, and standard deviations in per cent of the height.  Fitted so that, with what the
-# body hides, exchanged sides and definitions, errors are those above.
+# Mixtures of three Gaussians: shares, and standard deviations in per cent of the height.  They are fitted so that
+# errors, with occlusion, swaps and definitions, are those above.
 _TRUNK = ((0.795, 0.170, 0.035), (1.85, 5.0, 14.0))
 _MIDDLE = ((0.732, 0.215, 0.053), (1.84, 6.6, 17.0))
 _END = ((0.700, 0.220, 0.080), (2.25, 6.8, 21.7))
-# Annotators agree on faces three times as well as on shoulders and hips (the constants of COCO's keypoint evaluation).
+# Annotators agree on faces three times as well as on shoulders and hips (constants of COCO's keypoint evaluation).
 _FACE = ((0.795, 0.170, 0.035), (0.62, 1.7, 14.0))
 _GROUPS = {
     _TRUNK: ("head", "head_top", "neck", "thorax", "spine", "pelvis", "shoulder", "hip"),
@@ -34,8 +40,8 @@ _GROUPS = {
     ),
     _FACE: ("nose", "eye", "eye_inner", "eye_outer", "ear", "mouth_corner"),
 }
-_CLEAR, _GUESSED = 0.9, 1.5  # factors on small errors of points that are in sight, and of those that are not
-# What is exchanged together, and how often.
+_CLEAR, _GUESSED = 0.9, 1.5  # factors on small errors of visible and of occluded points
+# Points that are swapped together, and the probability.
 _SWAPS = (
     (("eye", "eye_inner", "eye_outer", "ear", "mouth_corner"), 0.006),
     (("shoulder",), 0.006),
@@ -45,26 +51,30 @@ _SWAPS = (
     (("knee",), 0.006),
     (("ankle", "heel", "big_toe", "small_toe", "foot_index"), 0.0125),
 )
-# Definitions: root mean square of the offset in per cent of stature, in how many directions, the points that share it.
-# Points of the middle stay there.
+# Definitions: root mean square of the offset in per cent of stature, its number of directions, the points that share
+# it.  Points of the middle stay in the middle.
 _DEFINITIONS = (
     (2.0, 3, ("hip", "pelvis")),
     (1.0, 3, ("shoulder", "neck")),
     (7.0, 2, ("head", "head_top")),
 )
-# Log odds of a confidence: of a perfect point, less for each per cent of error up to so many, less for a guess, and
-# their scatter.  So nearly all good points and half of the wild ones are above 0.3: some errors look sound.
-_SURE, _PER_ERROR, _MOST, _PER_GUESS, _SCATTER = 2.6, 0.16, 20.0, 0.8, 0.9
+# Log odds of a confidence.  With these figures nearly all good points and half of the gross errors are above 0.3, as
+# real detectors are confident of some of their errors.
+_PERFECT_ODDS = 2.6  # log odds of a point without error
+_ODDS_PER_ERROR = 0.16  # less for each per cent of error ...
+_MAX_ERROR = 20.0  # ... up to this error
+_ODDS_PER_GUESS = 0.8  # less for an occluded point
+_ODDS_SCATTER = 0.9  # standard deviation
 
 
 @dataclass(frozen=True)
 class Detections:
-    """What a detector says of N bodies, in the layout ``human``.
+    """The output of a detector for N bodies, in the layout ``human``.
 
     Attributes:
-        xy: (N,P,2) pixels; something also where it is not visible.
-        confidence: (N,P), whether or not it is visible.
-        visible: (N,P) reported with at least the confidence asked for.
+        xy: (N,P,2) pixels; also defined for points that are not visible.
+        confidence: (N,P) from 0 to 1; also defined for points that are not visible.
+        visible: (N,P) whether the point is reported with at least the minimum confidence.
     """
 
     xy: np.ndarray
@@ -73,10 +83,15 @@ class Detections:
 
 
 def redefined(points: np.ndarray, level: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Bodies (N,P,3) in metres as another annotation set marks them: systematic, so the same on both sides.
+    """Move points to where another annotation set would mark them.
 
-    The offsets are fixed to the body and drawn for each of the N with its level (N,): nobody knows those of a detector
-    that is yet to come.
+    Offsets are systematic: fixed to the body and equal on both sides.  They are drawn anew for each body, because the
+    definitions of future detectors are unknown.
+
+    Args:
+        points: (N,P,3) bodies, metres.
+        level: (N,) scale of the offsets.
+        rng: source of randomness.
     """
     axes, stature = _body_axes(points)
     points = points.copy()
@@ -93,7 +108,7 @@ _LATERAL = {"left": 1.0, "right": -1.0, "": 0.0}
 
 
 def _body_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (N,3,3) of the trunk in rows, to the left, up, forward; and stature (N,1) taken as 3.3 trunks."""
+    """Return the trunk's axes (N,3,3) in rows (left, up, forward), and stature (N,1), taken as 3.3 trunk lengths."""
     place = human_layout().names.index
     up = points[:, place("neck")] - points[:, place("pelvis")]
     trunk = np.linalg.norm(up, axis=1, keepdims=True)
@@ -109,31 +124,35 @@ def detect(
     height: np.ndarray,
     occluded: np.ndarray,
     level: np.ndarray,
-    views: Views,
+    views: ViewSettings,
     rng: np.random.Generator,
 ) -> Detections:
-    """Detect all points of ``human``.
+    """Simulate the detection of all points of ``human``.
 
     Args:
-        xy: (N,P,2) where they are, pixels. height: (N,) of the body in the image, pixels. occluded: (N,P) hidden by
-            the body itself. level: (N,) of the errors.
+        xy: (N,P,2) true positions, pixels.
+        height: (N,) of the bodies in the image, pixels.
+        occluded: (N,P) whether the body itself hides the point.
+        level: (N,) of the errors.
+        views: minimum confidence, and the share of occluded points that are reported.
+        rng: source of randomness.
     """
     error = _errors(occluded, level, rng)
     size = np.hypot(error[..., 0], error[..., 1])
     odds = (
-        _SURE
-        - _PER_ERROR * np.minimum(size, _MOST)
-        + level[:, None] * (_SCATTER * rng.standard_normal(size.shape) - _PER_GUESS * occluded)
+        _PERFECT_ODDS
+        - _ODDS_PER_ERROR * np.minimum(size, _MAX_ERROR)
+        + level[:, None] * (_ODDS_SCATTER * rng.standard_normal(size.shape) - _ODDS_PER_GUESS * occluded)
     )
     found = xy + height[:, None, None] / 100 * error
     confidence = 1 / (1 + np.exp(-odds))
     lost = occluded & (rng.random(size.shape) < (1 - views.guessed) * level[:, None])
     visible = (confidence >= views.min_confidence) & ~lost
-    return Detections(*_exchanged((found, confidence, visible), level, rng))
+    return Detections(*_swap_sides((found, confidence, visible), level, rng))
 
 
 def _errors(occluded: np.ndarray, level: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(N,P,2) per cent of the height.  The level scales small errors, and the share of the large ones."""
+    """Draw errors (N,P,2) in per cent of the height; the level scales small errors and the share of large ones."""
     shares, sizes = _mixture()
     u = rng.random(occluded.shape)
     worst = u < shares[:, 2] * level[:, None]
@@ -143,8 +162,8 @@ def _errors(occluded: np.ndarray, level: np.ndarray, rng: np.random.Generator) -
     return size[..., None] * rng.standard_normal((*size.shape, 2))
 
 
-def _exchanged(arrays: tuple[np.ndarray, ...], level: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
-    """Left and right of a few limbs exchanged, in each of the arrays (N,P,...); the detector knows nothing of it."""
+def _swap_sides(arrays: tuple[np.ndarray, ...], level: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+    """Swap left and right of a few limbs in each of the arrays (N,P,...); confidences do not show it."""
     swapped = np.zeros(arrays[1].shape, bool)
     for parts, share in _SWAPS:
         swapped[:, _points(parts)] = (rng.random(len(level)) < share * level)[:, None]
@@ -156,7 +175,7 @@ def _exchanged(arrays: tuple[np.ndarray, ...], level: np.ndarray, rng: np.random
 
 @cache
 def _mixture() -> tuple[np.ndarray, np.ndarray]:
-    """Shares and sizes (P,3) of each point's mixture."""
+    """Return shares and standard deviations (P,3) of each point's mixture."""
     groups = np.zeros((2, len(human_layout().names), 3))
     for (shares, sizes), parts in _GROUPS.items():
         groups[0, _points(parts)], groups[1, _points(parts)] = shares, sizes
@@ -165,7 +184,7 @@ def _mixture() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _points(parts: tuple[str, ...]) -> list[int]:
-    """Indices of the named parts, of both sides."""
+    """Return the indices of the named parts on both sides."""
     return [
         index
         for index, (name, side) in enumerate(zip(human_layout().names, human_layout().sides))
@@ -173,10 +192,15 @@ def _points(parts: tuple[str, ...]) -> list[int]:
     ]
 
 
-def reported(found: Detections, layouts: np.ndarray, views: Views) -> Detections:
-    """What remains where each of N detectors reports one layout: its points, and those that are means of some.
+def reported(found: Detections, layouts: np.ndarray, views: ViewSettings) -> Detections:
+    """Keep the points of each detector's layout, and those that are derived from them as means.
 
-    Mapped by ``Layout.map_to``, as the node does.  layouts: (N,) indices of ``views.layouts``.
+    Points are mapped by ``Layout.map_to``, as in the node.
+
+    Args:
+        found: detections of all points of ``human``.
+        layouts: (N,) indices of ``views.layouts``, one a detector.
+        views: names of the layouts.
     """
     xy, confidence, visible = found.xy.copy(), found.confidence.copy(), found.visible.copy()
     for index, (name, _) in enumerate(views.layouts):
@@ -184,7 +208,7 @@ def reported(found: Detections, layouts: np.ndarray, views: Views) -> Detections
         if name == COMPLETE or not len(rows):
             continue
         mapping = human_mapping(name)
-        own = [human_layout().names.index(point) for point in mapping.source.names]
+        own = np.array([human_layout().names.index(point) for point in mapping.source.names])
         mapped = mapping(*(array[np.ix_(rows, own)] for array in (found.xy, found.confidence, found.visible)))
         xy[rows] = np.where(np.isfinite(mapped[0]), mapped[0], xy[rows])
         confidence[rows], visible[rows] = mapped[1], mapped[2]

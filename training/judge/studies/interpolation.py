@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes on the straight line between two codes of a finished model, as a strip. Needs no torch, and no truth."""
+"""Strip of shapes on the straight line between two codes of a finished model. Needs neither torch nor truth."""
 
 from __future__ import annotations
 
@@ -18,26 +18,33 @@ from paul_ros.orthographic_n_point import onp
 from training.categories import among_categories
 from training.data import load_training_data
 from training.errors import DataError
-from training.judge.pictures import bare, between, draw_shape, new_figure, save_figure, turned_view
+from training.judge.pictures import blue_to_red, draw_shape, frame_panels, new_figure, save_figure, turned_view
 from training.judge.truth import Sequence
 
 _SHAPES = 9
-_DRAWN = ("shapes", "seen", "edges")
-_COMPARED = 500  # frames whose codes are compared for the farthest pair
+_PICTURE_ONLY = ("shapes", "seen", "edges")
+_COMPARED = 500  # frames whose codes are compared to find the farthest pair
 
 
 def run(model_name: str | Path, files: list[Path], folder: Path, frames: tuple[int, int] | None) -> str:
-    """Interpolate between two frames of each file; writes interpolation.json and .png, returns the table.
+    """Interpolate between two frames of each file, and write interpolation.json and interpolation.png into a folder.
 
     Args:
-        frames: numbers of the two; None takes those whose codes are farthest apart.
+        model_name: file or shipped model.
+        files: npz files with W.
+        folder: of table and picture.
+        frames: numbers of the two frames; None takes those whose codes are farthest apart.
+
+    Returns:
+        The table.
 
     Raises:
-        ModelError, DataError: a file that cannot be used, or does not have these frames.
+        ModelError: the model cannot be used.
+        DataError: a file cannot be used, or lacks these frames.
     """
     model = load_model(model_name)
-    strips = [_strip(model, _views(file, model), frames) for file in files]
-    lines = [{key: value for key, value in strip.items() if key not in _DRAWN} for strip in strips]
+    strips = [_strip(model, _load_views(file, model), frames) for file in files]
+    lines = [{key: value for key, value in strip.items() if key not in _PICTURE_ONLY} for strip in strips]
     write_json(
         folder / "interpolation.json",
         {"study": "interpolation", "model": model.name, "rows": lines, "versions": versions()},
@@ -46,19 +53,21 @@ def run(model_name: str | Path, files: list[Path], folder: Path, frames: tuple[i
     return _table(lines)
 
 
-def _views(file: Path, model: Model) -> Sequence:
-    """What is seen in a file, of one category where it has the name of one; without truth."""
+def _load_views(file: Path, model: Model) -> Sequence:
+    """Read a file as a sequence without truth; a file named like one of the model's categories has its points."""
     data = load_training_data(file)
     if data.left_out:
         print(
-            f"{file}: {data.left_out} of the frames show too few points; frame numbers leave them out", file=sys.stderr
+            f"{file}: {data.left_out} of the frames show too few points; frame numbers do not count them",
+            file=sys.stderr,
         )
     unknown = np.full((len(data.W), 3, data.W.shape[2]), np.nan)
     views = Sequence(Path(file).stem, data.W, data.visible, unknown, np.zeros((0, 2), int), metres=False)
     return among_categories(views, model.layout)
 
 
-def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> dict:
+def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> dict[str, Any]:
+    """Return the shapes of one file, in the first frame's camera, and how much they change."""
     count, points = sequence.visible.shape
     if points != len(model.layout.names):
         raise DataError(f"'{sequence.name}' has {points} points, model '{model.name}' {len(model.layout.names)}")
@@ -70,7 +79,7 @@ def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> 
     share = np.linspace(0, 1, _SHAPES)[:, None]
     shapes = model.decode((1 - share) * ends[:1] + share * ends[1:]).astype(float)
     pose = onp(shapes[:1], W[:1], visible[:1])
-    shapes[:, :, ~_own(model, sequence)] = np.nan
+    shapes[:, :, ~_category_points(model, sequence)] = np.nan
     shapes = pose.R @ (shapes - np.nanmean(shapes, axis=2, keepdims=True))
     size = _norm(shapes).mean()
     return {
@@ -84,27 +93,30 @@ def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> 
     }
 
 
-def _own(model: Model, sequence: Sequence) -> np.ndarray:
-    """(P,) bool: the points of the sequence's category; all, where it is none."""
+def _category_points(model: Model, sequence: Sequence) -> np.ndarray:
+    """Return which points (P,) belong to the sequence's category; all if the model has no such category."""
     points = range(len(model.layout.names))
     return np.isin(points, model.layout.categories.get(sequence.name, points))
 
 
 def _norm(shapes: np.ndarray) -> np.ndarray:
-    """Of shapes (...,3,P), over the points that are there."""
+    """Return the norm of shapes (...,3,P); points of NaN are ignored."""
     return np.sqrt(np.nansum(shapes**2, axis=(-2, -1)))
 
 
 def _farthest(model: Model, sequence: Sequence) -> tuple[int, int]:
-    """The two frames whose codes are farthest apart, of up to _COMPARED evenly chosen ones."""
+    """Return the two frames whose codes are farthest apart, of up to ``_COMPARED`` evenly chosen ones."""
     rows = np.linspace(0, len(sequence.W) - 1, min(_COMPARED, len(sequence.W))).astype(int)
     codes = model.encode(sequence.W[rows], sequence.visible[rows]).astype(float)
     square = (codes**2).sum(1)
     apart = square[:, None] + square - 2 * codes @ codes.T
-    return tuple(sorted(rows[list(np.unravel_index(apart.argmax(), apart.shape))].tolist()))
+    one, other = np.unravel_index(apart.argmax(), apart.shape)
+    first, last = sorted((int(rows[one]), int(rows[other])))
+    return first, last
 
 
-def _table(lines: list[dict]) -> str:
+def _table(lines: list[dict[str, Any]]) -> str:
+    """Format a line a file."""
     head = "change from shape to shape in % of the size, along the straight line between two codes"
     rows = [
         f"{line['data']:<12} frames {line['frames'][0]:>6} and {line['frames'][1]:>6}: "
@@ -115,10 +127,10 @@ def _table(lines: list[dict]) -> str:
     return "\n".join([head, *rows])
 
 
-def _draw(model: Model, strips: list[dict]) -> Any:
-    """A row a file: what was seen in the first and the last frame, and between them all shapes; blue to red.
+def _draw(model: Model, strips: list[dict[str, Any]]) -> Any:
+    """Draw a row a file, blue to red: the first frame as seen, all shapes, the last frame as seen.
 
-    The shapes are those before the first frame's camera, turned a little.
+    Shapes are in the first frame's camera, turned a little.
     """
     figure = new_figure(1.55 * (_SHAPES + 2), 2.3 * len(strips) + 0.5)
     figure.suptitle(f"Between two codes of {model.name}", fontsize=12, fontweight="bold")
@@ -127,11 +139,11 @@ def _draw(model: Model, strips: list[dict]) -> Any:
         shares = np.linspace(0, 1, _SHAPES)
         turned = turned_view(strip["shapes"])
         for ax, share, shape in zip(row[1:-1], shares, turned):
-            draw_shape(ax, shape, strip["edges"], between(share))
+            draw_shape(ax, shape, strip["edges"], blue_to_red(share))
             ax.set_title(f"{share:.3g}", fontsize=9)
         for ax, share, seen, number in zip(row[[0, -1]], (0.0, 1.0), strip["seen"], strip["frames"]):
-            draw_shape(ax, seen, strip["edges"], between(share))
+            draw_shape(ax, seen, strip["edges"], blue_to_red(share))
             ax.set_title(f"{strip['data']}\nframe {number} as seen", fontsize=9)
-        bare(row[1:-1], turned)
-        bare(row[[0, -1]], strip["seen"])
+        frame_panels(row[1:-1], turned)
+        frame_panels(row[[0, -1]], strip["seen"])
     return figure

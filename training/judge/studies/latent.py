@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Latent spaces of two dimensions, coloured by frame number (the paper's figure 4): a good one keeps neighbours close.
+"""Study of two-dimensional latent spaces, coloured by frame number: the paper's figure 4.
 
-The order of the frames is used to look at the codes, never to find them.
+Codes of successive frames are close in a good latent space.  The order of the frames is used for the picture and for
+roughness only, never by the trainer.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from training.judge.experiments import Outcome, Run, chosen, groups, summary
-from training.judge.pictures import method_look, middle_and_half, new_figure
+from training.judge.experiments import Experiment, Outcome, chosen, groups, summary
+from training.judge.pictures import bounding_square, method_style, new_figure
 from training.judge.studies.study import Study
 from training.judge.truth import Sequence
 
@@ -21,8 +22,8 @@ _SMOOTH, _RANDOM = "own cameras", "random cameras"
 _PAIRS = 20_000
 
 
-def runs(sequences: list[Sequence], seeds: int, values: tuple[str, ...], settings: tuple[str, ...]) -> list[Run]:
-    """Every method on every sequence as it is and, where its whole truth is known, from random cameras."""
+def plan(sequences: list[Sequence], seeds: int, values: tuple[str, ...], settings: tuple[str, ...]) -> list[Experiment]:
+    """Plan every method on every sequence, and on its random-camera twin if the whole truth is known."""
     series = []
     for sequence in sequences:
         series.append((sequence, _SMOOTH))
@@ -30,7 +31,7 @@ def runs(sequences: list[Sequence], seeds: int, values: tuple[str, ...], setting
             turned = sequence.from_random_cameras(seed=0)
             series.append((replace(turned, name=sequence.name), _RANDOM))
     return [
-        Run(sequence, method, seed, (*settings, "bottleneck=2"), cameras, cameras)
+        Experiment(sequence, method, seed, (*settings, "bottleneck=2"), cameras, cameras)
         for sequence, cameras in series
         for method in values
         for seed in range(seeds)
@@ -38,26 +39,42 @@ def runs(sequences: list[Sequence], seeds: int, values: tuple[str, ...], setting
 
 
 def roughness(codes: np.ndarray) -> float:
-    """Mean distance of the codes (F,K) of successive frames, over that of random pairs: 1 is no order, 0 a thread."""
+    """Return the mean distance of successive frames' codes (F,K), over that of random pairs.
+
+    A smooth curve has roughness 0, codes without order have 1.
+    """
     rng = np.random.default_rng(0)
     first, second = rng.integers(len(codes), size=(2, _PAIRS))
     apart = np.linalg.norm(codes[first] - codes[second], axis=1)[first != second].mean()
     return float(np.linalg.norm(np.diff(codes, axis=0), axis=1).mean() / max(apart, np.finfo(float).tiny))
 
 
-def _series(outcomes: list[Outcome]) -> dict[tuple, list[Outcome]]:
-    return groups(outcomes, lambda outcome: (outcome.run.sequence.name, outcome.run.value, outcome.run.method))
+def _chosen_codes(outcomes: list[Outcome]) -> np.ndarray:
+    """Return the codes (F,K) of the outcome that is chosen without truth."""
+    codes = chosen(outcomes).codes
+    assert codes is not None  # Study.needs_codes
+    return codes
 
 
-def report(outcomes: list[Outcome]) -> dict:
-    """A line for each sequence, kind of cameras and method; roughness is that of the run chosen without truth."""
+def _series(outcomes: list[Outcome]) -> dict[Any, list[Outcome]]:
+    """Group outcomes by sequence, kind of cameras and method."""
+
+    def key(outcome: Outcome) -> tuple[str, float | str, str]:
+        experiment = outcome.experiment
+        return experiment.sequence.name, experiment.value, experiment.method
+
+    return groups(outcomes, key)
+
+
+def report(outcomes: list[Outcome]) -> dict[str, Any]:
+    """Report a line for each sequence, kind of cameras and method, with the roughness of the chosen seed."""
     return {
         "summary": [
             {
                 "sequence": name,
                 "cameras": cameras,
                 "method": method,
-                "roughness": roughness(chosen(some).codes),
+                "roughness": roughness(_chosen_codes(some)),
                 **summary(some),
             }
             for (name, cameras, method), some in _series(outcomes).items()
@@ -65,8 +82,8 @@ def report(outcomes: list[Outcome]) -> dict:
     }
 
 
-def table(report: dict) -> str:
-    """A line each."""
+def table(report: dict[str, Any]) -> str:
+    """Format a report."""
     lines = [
         f"{row['sequence']:<12}{row['cameras']:<16}{row['method']:<8}{row['roughness']:>10.3f}"
         f"{row['chosen_ne_flip_frame_percent']:>9.2f} /{row['chosen_ne_flip_global_percent']:>7.2f}"
@@ -76,14 +93,14 @@ def table(report: dict) -> str:
         [
             f"{'sequence':<12}{'cameras':<16}{'method':<8}{'roughness':>10}{'NE %':>18}",
             *lines,
-            "roughness: mean distance of successive frames' codes over that of random pairs, 1 where order shows "
-            "nothing;\nNE with the depth flipped per frame / once for all; both of the run with the lowest loss, K = 2",
+            "roughness: mean distance of successive frames' codes over that of random pairs; 1 means no order\n"
+            "NE: depth flipped per frame / once for all; both figures are of the run with the lowest loss, K = 2",
         ]
     )
 
 
-def draw(outcomes: list[Outcome], report: dict) -> Any:
-    """A panel for each sequence, kind of cameras and method; dark blue the first frame, bright yellow the last."""
+def draw(outcomes: list[Outcome], report: dict[str, Any]) -> Any:
+    """Draw a panel for each sequence, kind of cameras and method, from the first frame (blue) to the last (yellow)."""
     series = _series(outcomes)
     columns = list(dict.fromkeys((name, cameras) for name, cameras, _ in series))
     methods = list(dict.fromkeys(method for _, _, method in series))
@@ -91,17 +108,17 @@ def draw(outcomes: list[Outcome], report: dict) -> Any:
     axes = figure.subplots(len(methods), len(columns), squeeze=False)
     for (name, cameras, method), some in series.items():
         ax = axes[methods.index(method), columns.index((name, cameras))]
-        codes = chosen(some).codes
+        codes = _chosen_codes(some)
         shown = ax.scatter(*codes.T, c=np.arange(len(codes)), cmap="plasma", s=9, linewidths=0)
-        (x, y), half = middle_and_half(codes)
+        (x, y), half = bounding_square(codes)
         ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half), xticks=[], yticks=[], aspect="equal")
         head = f"{name}, {cameras}\n" if ax in axes[0] else ""
         ax.set_title(f"{head}roughness {roughness(codes):.2f}", fontsize=10)
         if ax in axes[:, 0]:
-            ax.set_ylabel(method_look(method)[0], fontsize=12, fontweight="bold")
+            ax.set_ylabel(method_style(method)[0], fontsize=12, fontweight="bold")
     bar = figure.colorbar(shown, ax=axes, shrink=0.6, pad=0.01, ticks=[0, len(codes) - 1])
     bar.ax.set_yticklabels(["first\nframe", "last\nframe"])
     return figure
 
 
-STUDY = Study("latent", runs, report, table, draw, METHODS)
+STUDY = Study("latent", plan, report, table, draw, METHODS, needs_codes=True)

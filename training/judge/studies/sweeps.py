@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error against one thing that is varied: bottleneck, noise of the points, share of hidden points."""
+"""Studies of the error against one varied quantity: bottleneck, noise, share of hidden points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from training.judge.experiments import Outcome, Run, chosen, groups, summary
+from training.judge.experiments import Experiment, Outcome, chosen, groups, outcome_row, summary
 from training.judge.pictures import COLOURS, legend_above, new_figure, percent_axis, titled
 from training.judge.studies.study import Study
 from training.judge.truth import Sequence
@@ -17,28 +17,30 @@ from training.judge.truth import Sequence
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is varied.
+    """A varied quantity.
 
     Attributes:
         name: of the study.
-        axis: what values are called.
-        values: tried by default.
-        vary: the run for a sequence, value, seed and overrides.
-        reference: what ratios are to, for people.
-        against_best: that is the best value, else value 0.
-        percent: values are shares.
+        axis: name of the quantity in tables and pictures.
+        values: values to try by default.
+        vary: makes the experiment of a sequence, value, seed and overrides.
+        reference: name of the value that ratios refer to.
+        against_best: whether ratios refer to the best value; otherwise to value 0.
+        percent: whether values are shares.
     """
 
     name: str
     axis: str
     values: tuple[float, ...]
-    vary: Callable[[Sequence, float, int, tuple[str, ...]], Run]
+    vary: Callable[[Sequence, float, int, tuple[str, ...]], Experiment]
     reference: str
     against_best: bool = False
     percent: bool = False
 
-    def runs(self, sequences: list[Sequence], seeds: int, values: tuple, settings: tuple[str, ...]) -> list[Run]:
-        """Every value of every sequence, as often as there are seeds."""
+    def plan(
+        self, sequences: list[Sequence], seeds: int, values: tuple[float, ...], settings: tuple[str, ...]
+    ) -> list[Experiment]:
+        """Plan every value of every sequence with every seed."""
         return [
             self.vary(sequence, value, seed, settings)
             for sequence in sequences
@@ -46,13 +48,13 @@ class Sweep:
             for seed in range(seeds)
         ]
 
-    def shown(self, value: float) -> str:
-        """A value, for people."""
+    def format(self, value: float) -> str:
+        """Format a value."""
         return f"{100 * value:g} %" if self.percent else f"{value:g}"
 
-    def report(self, outcomes: list[Outcome]) -> dict:
-        """A row a run, and a line of summary for each sequence and value."""
-        series = groups(outcomes, lambda outcome: (outcome.run.sequence.name, outcome.run.value))
+    def report(self, outcomes: list[Outcome]) -> dict[str, Any]:
+        """Report a row for each outcome, and a line of summary for each sequence and value."""
+        series = groups(outcomes, lambda outcome: (outcome.experiment.sequence.name, outcome.experiment.value))
         picks = {id(chosen(some)) for some in series.values()}
         lines = [{"sequence": name, "value": value, **summary(some)} for (name, value), some in series.items()]
         for line in lines:
@@ -61,28 +63,23 @@ class Sweep:
             "axis": self.axis,
             "rows": [
                 {
-                    "sequence": outcome.run.sequence.name,
-                    "value": outcome.run.value,
-                    "seed": outcome.run.seed,
-                    "ne_flip_frame_percent": outcome.ne_flip_frame_percent,
-                    "ne_flip_global_percent": outcome.ne_flip_global_percent,
-                    "loss": outcome.loss,
-                    "seconds": outcome.seconds,
-                    "chosen": id(outcome) in picks,
+                    "sequence": outcome.experiment.sequence.name,
+                    "value": outcome.experiment.value,
+                    **outcome_row(outcome, id(outcome) in picks),
                 }
                 for outcome in outcomes
             ],
             "summary": lines,
         }
 
-    def _ratio(self, line: dict, others: list[dict]) -> float | None:
-        """Of the median error to that of the best value or of value 0."""
+    def _ratio(self, line: dict[str, Any], others: list[dict[str, Any]]) -> float | None:
+        """Return the median error over that of the reference; None if there is no reference."""
         key = "median_ne_flip_global_percent"
         found = [other[key] for other in others if self.against_best or other["value"] == 0]
         return line[key] / min(found) if found and min(found) > 0 else None
 
-    def table(self, report: dict) -> str:
-        """A line for each sequence and value."""
+    def table(self, report: dict[str, Any]) -> str:
+        """Format a line for each sequence and value."""
         head = (
             f"{'sequence':<12}{self.axis:>24}{'mean':>9}{'deviation':>11}{'median':>9}{'best':>8}{'worst':>8}{'bad':>7}"
             f"{'one flip':>10}{'ratio':>7}{'seconds':>9}"
@@ -97,7 +94,7 @@ class Sweep:
             bad = f"{round(row['bad_basin_share'] * row['runs'])}/{row['runs']}"
             ratio = "-" if row["ratio"] is None else f"{row['ratio']:.2f}"
             lines.append(
-                f"{name:<12}{self.shown(row['value']):>24}{mean:>9.2f}{deviation:>11.2f}{median:>9.2f}{best:>8.2f}"
+                f"{name:<12}{self.format(row['value']):>24}{mean:>9.2f}{deviation:>11.2f}{median:>9.2f}{best:>8.2f}"
                 f"{worst:>8.2f}{bad:>7}{row['median_ne_flip_global_percent']:>10.2f}{ratio:>7}"
                 f"{row['seconds_median']:>9.0f}"
             )
@@ -110,10 +107,10 @@ class Sweep:
             ]
         )
 
-    def draw(self, outcomes: list[Outcome], report: dict) -> Any:
-        """A line a sequence: the mean over runs, its deviation as a band, runs as faint dots (the paper's figure 5).
+    def draw(self, outcomes: list[Outcome], report: dict[str, Any]) -> Any:
+        """Draw a line a sequence, as the paper's figure 5: mean over runs, deviation as a band, runs as faint dots.
 
-        The mean with one flip for all is dashed: where it is higher, the runs mix a shape and its mirror image.
+        The mean with one flip for all is dashed.  If it is higher, runs mix a shape with its mirror image.
         """
         figure = new_figure(7.5, 5)
         ax = figure.subplots()
@@ -133,32 +130,33 @@ class Sweep:
         return figure
 
     def study(self) -> Study:
-        """As a study."""
-        return Study(self.name, self.runs, self.report, self.table, self.draw, self.values)
+        """Return the study."""
+        return Study(self.name, self.plan, self.report, self.table, self.draw, self.values)
 
 
-def _draw_line(ax: Any, lines: list[dict], factor: float, name: str, colour: str) -> None:
+def _draw_line(ax: Any, lines: list[dict[str, Any]], factor: float, name: str, colour: str) -> None:
+    """Draw mean, deviation and mean with one flip of a sequence."""
     x = np.array([factor * line["value"] for line in lines])
     mean, deviation, best, one_flip = (
         np.array([line[f"{key}_percent"] for line in lines])
         for key in ("mean_ne_flip_frame", "deviation_ne_flip_frame", "best_ne_flip_frame", "mean_ne_flip_global")
     )
-    low = np.maximum(mean - deviation, best)  # an axis of decades knows no zero
+    low = np.maximum(mean - deviation, best)  # a logarithmic axis has no zero
     ax.fill_between(x, low, mean + deviation, color=colour, alpha=0.18, linewidth=0)
     ax.plot(x, one_flip, color=colour, linewidth=1.2, linestyle="--")
     ax.plot(x, mean, color=colour, linewidth=2, marker="o", markersize=4, label=name)
 
 
-def _bottleneck(sequence: Sequence, K: float, seed: int, settings: tuple[str, ...]) -> Run:
-    return Run(sequence, "paul", seed, (*settings, f"bottleneck={K:g}"), f"K = {K:g}", K)
+def _bottleneck(sequence: Sequence, K: float, seed: int, settings: tuple[str, ...]) -> Experiment:
+    return Experiment(sequence, "paul", seed, (*settings, f"bottleneck={K:g}"), f"K = {K:g}", K)
 
 
-def _noise(sequence: Sequence, share: float, seed: int, settings: tuple[str, ...]) -> Run:
-    return Run(sequence.noisy(share, seed), "paul", seed, settings, f"noise {100 * share:g} %", share)
+def _noise(sequence: Sequence, share: float, seed: int, settings: tuple[str, ...]) -> Experiment:
+    return Experiment(sequence.noisy(share, seed), "paul", seed, settings, f"noise {100 * share:g} %", share)
 
 
-def _hidden(sequence: Sequence, share: float, seed: int, settings: tuple[str, ...]) -> Run:
-    return Run(sequence.hiding(share, seed), "paul", seed, settings, f"hidden {100 * share:g} %", share)
+def _hidden(sequence: Sequence, share: float, seed: int, settings: tuple[str, ...]) -> Experiment:
+    return Experiment(sequence.hiding(share, seed), "paul", seed, settings, f"hidden {100 * share:g} %", share)
 
 
 STUDIES = tuple(
