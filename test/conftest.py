@@ -156,9 +156,15 @@ def bag_make() -> BagMake:
 
 
 @pytest.fixture(scope="session", params=["rclpy", "rosbags"])
-def make(request):
+def every_make(request):
     """Both message factories: every test with this fixture runs twice."""
     return RosMake() if request.param == "rclpy" else request.getfixturevalue("bag_make")
+
+
+@pytest.fixture
+def make(every_make):
+    """Both message factories, unless a test module overrides this fixture with one."""
+    return every_make
 
 
 def header_of(make, seconds: int = 7, nanoseconds: int = 5, frame: str = "camera_color_optical_frame"):

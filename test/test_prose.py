@@ -111,6 +111,7 @@ def test_all_prose_of_a_file_is_read() -> None:
         "Module.",
         "Function.",
         "Why.",
+        "Alone.",
         "Two lines.",
     ]
     markdown = "# Of no use\n\nRead.\n\n```\nOf code.\n```\n| of | a table |\n\n- One.\n- Two.\n"
