@@ -2,8 +2,8 @@
 """Convert ROS messages to arrays and back: one module a message family, without any knowledge of lifting.
 
 All code is duck-typed over attributes. It reads the messages of rclpy and of rosbags alike, and imports no message
-package. The type name, PACKAGE/msg/NAME, selects the family. Other packages can add families (see docs/how_to/write_an_adapter.md);
-`record`, `by_name` and `split_persons` help to write them.
+package. The type name, PACKAGE/msg/NAME, selects the family. Other packages can add families, see
+docs/how_to/write_an_adapter.md; `record`, `by_name` and `split_persons` help to write them.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 """Adapters of other packages: found by entry points, loaded with the first message of their type, never trusted.
 
 A package declares an entry point in the group GROUP. Its name is the message type; its object is an Adapter.
-docs/how_to/write_an_adapter.md has a complete example. Faults of such an adapter cost only its own messages. These are dropped with a
-reason that names the package.
+docs/how_to/write_an_adapter.md has a complete example. Faults of such an adapter cost only its own messages. These are
+dropped with a reason that names the package.
 """
 
 from __future__ import annotations

@@ -58,13 +58,16 @@ MARKERS = {
 }
 #: Packages that a robot may lack. Test modules that import a missing one are not collected.
 OPTIONAL = ("torch", "rosbags", "mcap", "matplotlib", "rich", "tqdm", "scipy", "hypothesis", "catkin_pkg")
+#: Imported late by paul_ros.offline.bag.
+BAGS = {"rosbags", "mcap"}
 MISSING = {package for package in OPTIONAL if importlib.util.find_spec(package) is None}
 
 
 @functools.cache
 def packages_of(module: str) -> set[str]:
-    """Return the foreign packages that a test module loads, itself or through others."""
-    return {name.partition(".")[0] for name in import_graph.reached([module])}
+    """Return the foreign packages that a test module needs, itself or through others."""
+    reached = import_graph.reached([module])
+    return {name.partition(".")[0] for name in reached} | (BAGS if "paul_ros.offline.bag" in reached else set())
 
 
 _FILES = sorted(Path(__file__).parent.glob("test_*.py"))
