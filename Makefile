@@ -7,7 +7,7 @@ PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --c
 SOURCES := setup.py setup.cfg pyproject.toml package.xml \
 	$(shell find paul_ros msg_adapters training lib launch config rviz foxglove sros2 resource bags -type f -not -path '*/__pycache__/*')
 
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test test-fast lint clean
 
 setup: $(VENV)/.package
 
@@ -30,8 +30,15 @@ $(VENV)/.robot: $(VENV)/.dependencies
 		"numpy==1.26.4; python_version < '3.13'" "PyYAML==6.0.1; python_version < '3.13'"
 	touch $@
 
+# Tests that start nodes share one worker (see test/conftest.py); the others run beside it.
+PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadgroup
+
 test: setup $(VENV)/.robot
-	$(VENV)/bin/python -m pytest
+	$(PYTEST)
+
+# Without nodes, installs, training and long searches: for every save.
+test-fast: setup
+	$(PYTEST) -m "not (dds or install or training or slow)"
 
 lint: setup
 	$(VENV)/bin/ruff check .

@@ -51,10 +51,11 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # --- which tests run where
 
-#: Marker -> the fixtures and modules that need it. `make test-fast` runs the tests without any of these markers.
+#: Marker -> the fixtures, modules and tests that get it. `make test-fast` runs the tests without any marker.
 MARKERS = {
     "dds": {"ros", "start_lifter", "test_demo", "test_benchmark_node"},
     "install": {"install", "installed", "compiled"},
+    "slow": {"test_no_search_finds_a_better_pose", "test_onp_docs"},
 }
 #: Packages that a robot may lack. Test modules that import a missing one are not collected.
 OPTIONAL = ("torch", "rosbags", "mcap", "matplotlib", "rich", "tqdm", "scipy", "hypothesis", "catkin_pkg")
@@ -74,15 +75,24 @@ _FILES = sorted(Path(__file__).parent.glob("test_*.py"))
 collect_ignore = [file.name for file in _FILES if MISSING and packages_of(file.stem) & MISSING]
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark each test by its fixtures, its module and whether the module loads torch."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark each test by its fixtures, its module and its name, and by whether the module loads torch.
+
+    With pytest-xdist, all tests that start nodes or install run in one worker: the demo chooses a domain of its own,
+    which may be that of another worker. The tests of any other module stay together too, with the module's fixtures.
+    """
     for item in items:
-        traits = {*getattr(item, "fixturenames", ()), item.path.stem}
-        for marker, needing in MARKERS.items():
-            if traits & needing:
+        module = item.path.stem
+        traits = {*getattr(item, "fixturenames", ()), module, getattr(item, "originalname", None)}
+        for marker, wanted in MARKERS.items():
+            if traits & wanted:
                 item.add_marker(marker)
-        if "torch" in packages_of(item.path.stem):
+        if "torch" in packages_of(module):
             item.add_marker("training")
+        if config.pluginmanager.hasplugin("xdist"):
+            alone = any(item.get_closest_marker(marker) for marker in ("dds", "install"))
+            item.add_marker(pytest.mark.xdist_group("nodes" if alone else module))
 
 
 def _missing(error: BaseException | None) -> bool:
