@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# `make demo` and `make test` need Python 3.10 or newer with pip and venv; all else goes into .venv.
+# Needs Python 3.10 or newer with pip and venv. All other packages are installed into .venv.
 PYTHON ?= python3
 VENV := .venv
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
@@ -11,7 +11,7 @@ SOURCES := setup.py setup.cfg pyproject.toml package.xml \
 
 setup: $(VENV)/.package
 
-# Not an editable install: that would put nothing where `ros2 run` looks. Sources that changed are installed anew.
+# Not an editable install: that would put nothing where `ros2 run` looks. Changed sources are installed again.
 $(VENV)/.package: $(VENV)/.dependencies $(SOURCES)
 	rm -rf build
 	$(PIP) --no-deps --no-build-isolation .
@@ -23,7 +23,7 @@ $(VENV)/.dependencies: constraints.txt setup.cfg
 	$(PIP) --no-build-isolation ".[ros,train,bags,docs,test]"
 	touch $@
 
-# What apt gives a robot on Ubuntu 24.04. NumPy 1.26 has no wheels for Python 3.13; its test is left out there.
+# The versions of apt on Ubuntu 24.04. NumPy 1.26 has no wheels for Python 3.13, so its test is skipped there.
 $(VENV)/.robot: $(VENV)/.dependencies
 	$(PYTHON) -m venv $(VENV)/robot
 	$(VENV)/robot/bin/python -m pip install --quiet --disable-pip-version-check \
@@ -33,8 +33,10 @@ $(VENV)/.robot: $(VENV)/.dependencies
 # Tests that start nodes share one worker (see test/conftest.py); the others run beside it.
 PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist loadgroup
 
+# Linting comes last, so that a fault of style does not hide the tests; mypy takes 15 s, with its cache 1 s.
 test: setup $(VENV)/.robot
 	$(PYTEST)
+	@$(MAKE) --no-print-directory lint
 
 # Without nodes, installs, training and long searches: for every save.
 test-fast: setup

@@ -55,10 +55,8 @@ TORCH = {"torch", "torchvision"}
 ROBOT = {"numpy", "yaml"}
 
 MAX_LINES = 350
-#: Modules that may be larger, each with the reason.
-LARGE = {
-    "paul_ros.viewing_sphere": "one algorithm of the paper, with its derivation and its certificate",
-}
+#: At most two modules that may be larger, each with the reason.
+LARGE: dict[str, str] = {}
 MAX_NODE_LINES = 250
 
 
