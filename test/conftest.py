@@ -48,6 +48,9 @@ import pytest
 from foreign_messages import DEFINITIONS
 
 ROOT = Path(__file__).resolve().parent.parent
+_VENV = ROOT / ".venv"
+#: Whether this Python is the one that the Makefile sets up.
+IN_VENV = _VENV.exists() and os.path.samefile(sys.prefix, _VENV)
 
 # --- which tests run where
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import import_graph
 import pytest
+from conftest import IN_VENV
 from import_graph import PACKAGES, ROOT, Import, imports_in
 
 #: Room -> the other rooms that it may import. A room is a package, or a folder with an entry here; `paul_ros` is the
@@ -158,7 +159,7 @@ def test_the_adapters_import_no_message_package() -> None:
 
 @pytest.mark.install
 @pytest.mark.skipif(sys.version_info >= (3, 13), reason="NumPy 1.26 has no wheels for Python 3.13")
-@pytest.mark.skipif(Path(sys.prefix) != ROOT / ".venv", reason="`make test` sets up the robot's environment")
+@pytest.mark.skipif(not IN_VENV, reason="`make test` sets up the robot's environment")
 def test_a_model_lifts_the_same_on_the_robots_numpy(model_file) -> None:
     """`make test` sets up .venv/robot with apt's versions, NumPy 1.26 and PyYAML, and nothing else."""
     code = """

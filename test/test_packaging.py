@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 import yaml
 from catkin_pkg.package import parse_package
+from conftest import IN_VENV
 
 import paul_ros
 
@@ -239,7 +240,7 @@ def test_package_xml_names_nothing_that_only_pip_has() -> None:
     assert not names & {"mcap-ros2-support", "python3-torch"}
 
 
-@pytest.mark.skipif(Path(sys.prefix) != ROOT / ".venv", reason="`make test` sets up this environment")
+@pytest.mark.skipif(not IN_VENV, reason="`make test` sets up this environment")
 def test_the_environment_runs_this_source() -> None:
     """Otherwise tests that start `paul` or the node would test older code."""
 
