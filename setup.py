@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files that ROS looks for outside Python packages; all else about the package is in setup.cfg."""
+"""Install the files that ROS needs outside Python packages; setup.cfg has all other metadata."""
 
 from pathlib import Path
 
 from setuptools import setup
 
 NAME = "paul_ros"
-BAGS = ("one_person", "two_persons_crossing")  # what `paul demo` plays
+BAGS = ("one_person", "two_persons_crossing")  # played by `paul demo`
 
 
 def shared(folder: str) -> tuple[str, list[str]]:
-    """The files of one top-level folder, to be put under share/paul_ros."""
+    """Return the target under share/paul_ros and the files of one top-level folder."""
     return f"share/{NAME}/{folder}", sorted(str(path) for path in Path(folder).iterdir() if path.is_file())
 
 

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to arrays and back, one module a message family; knows nothing of lifting.
+"""Convert ROS messages to arrays and back: one module a message family, without any knowledge of lifting.
 
-Everything here is duck-typed over attributes: the same code reads rclpy messages and rosbags dataclasses,
-and no message package is imported. A family is chosen by its type name as bags spell it. Other packages may add theirs,
-see docs/adapters.md; `record`, `by_name` and `split_persons` are for them.
+All code is duck-typed over attributes. It reads the messages of rclpy and of rosbags alike, and imports no message
+package. The type name, PACKAGE/msg/NAME, selects the family. Other packages can add families, see
+docs/how_to/write_an_adapter.md; `record`, `by_name` and `split_persons` help to write them.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 from msg_adapters import ai, hri, opendr, openpose, point_cloud2, pose_array, yolo, zed
 from msg_adapters.camera_info import read_camera_info
 from msg_adapters.depth_image import DepthImage, read_depth
+from msg_adapters.factory import MessageFactory
 from msg_adapters.keypoints import (
     Intrinsics,
     Keypoints2D,
@@ -24,12 +27,12 @@ from msg_adapters.keypoints import (
 )
 from msg_adapters.plugins import Adapter, Adapters, OnePerson
 
-#: Type name -> Adapter, those that other packages bring after the shipped ones.
+#: Type name -> Adapter: the shipped adapters, then those of other packages.
 SUPPORTED = Adapters(
     {
         "sensor_msgs/msg/PointCloud2": Adapter(point_cloud2.read),
         "geometry_msgs/msg/PoseArray": Adapter(pose_array.read),
-        # yolo_ros numbers points only, but those of its pose models are COCO's.
+        # yolo_ros only numbers its points, but its pose models use COCO's order.
         "yolo_msgs/msg/DetectionArray": Adapter(yolo.read, lambda _: "coco17"),
         "hri_msgs/msg/Skeleton2D": Adapter(hri.read, lambda _: "hri18", one_person=True),
         "zed_msgs/msg/ObjectsStamped": Adapter(zed.read, zed.layout),
@@ -40,26 +43,33 @@ SUPPORTED = Adapters(
     }
 )
 
-#: Types whose message is one person: those of one stamp are of one image.
+#: The types with one person a message: messages with equal stamps are persons of one image.
 ONE_PERSON = OnePerson(SUPPORTED)
 
 
-def read(type_name: str, msg, points: int, source: Source = Source()) -> Keypoints2D:
-    """Reads a 2D keypoint message for a layout of `points` keypoints.
+def read(type_name: str, msg: Any, points: int, source: Source = Source()) -> Keypoints2D:
+    """Read a 2D keypoint message.
 
-    Raises MessageError with a reason to count by and a sentence that says what to do.
+    Args:
+        type_name: PACKAGE/msg/NAME.
+        msg: the message, of rclpy or rosbags.
+        points: number of keypoints of the layout.
+        source: facts beside the message that some families need.
+
+    Raises:
+        MessageError: the message cannot be used; has a reason to count by and advice.
     """
     adapter = SUPPORTED.get(type_name)
     if adapter is None:
         raise MessageError(
             "unknown_type",
-            f"{type_name} is no keypoint message that can be read here; readable are {', '.join(SUPPORTED)}",
+            f"{type_name} has no adapter; publish one of {', '.join(SUPPORTED)}, or write an adapter for it",
         )
     return adapter.read(msg, points, source)
 
 
-def named_layout(type_name: str, msg) -> str | None:
-    """The shipped layout whose points the messages of a family are, by what this one says; None = it does not say."""
+def named_layout(type_name: str, msg: Any) -> str | None:
+    """Return the name of the shipped layout that a message's points have, or None if the message does not tell."""
     return SUPPORTED[type_name].layout(msg) if type_name in SUPPORTED else None
 
 
@@ -71,6 +81,7 @@ __all__ = [
     "Intrinsics",
     "Keypoints2D",
     "MessageError",
+    "MessageFactory",
     "Source",
     "WrongPointCount",
     "by_name",

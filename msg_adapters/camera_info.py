@@ -4,44 +4,47 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from msg_adapters.keypoints import Intrinsics, MessageError
 
-#: The focal length of a camera lies within these multiples of the image's larger side ...
+#: Limits of a focal length in multiples of the image's larger side.
 _FOCAL_PER_SIDE = (0.1, 100.0)
-#: ... or, where the message does not give the size, within these limits in pixels.
+#: Limits of a focal length in pixels, for messages without an image size.
 _FOCAL_PIXELS = (10.0, 1e6)
 
 
-def read_camera_info(msg) -> Intrinsics:
-    """Reads focal lengths and principal point (pixels) of the rectified image.
+def read_camera_info(msg: Any) -> Intrinsics:
+    """Read the focal lengths and the principal point, in pixels of the rectified image.
 
-    That is described by P (row-major 3x4), not by K, which is of the raw image. K (row-major 3x3) is used only
-    where P is not filled: its focal lengths are not positive, or a number of it is not finite. The result says
-    which it was, and whether K then comes with distortion that nobody corrects. Source: the comments of
+    They come from P (row-major 3x4), which describes the rectified image. K (row-major 3x3) describes the raw image.
+    It is the fallback if P's focal lengths are not positive or if one of its numbers is not finite. The result states
+    the matrix, and whether K comes with distortion that nobody corrects. Source: the comments of
     sensor_msgs/CameraInfo.
 
-    Raises MessageError bad_intrinsics for a focal length or principal point that no camera has: zero as of an
-    uncalibrated camera, not finite, or out of all proportion to the image, as where K is normalised.
+    Raises:
+        MessageError: bad_intrinsics. A number is not finite, is zero (the camera is not calibrated), or is out of
+            proportion to the image (K is normalised).
     """
-    rectified = [float(msg.p[index]) for index in (0, 5, 2, 6)]
-    if rectified[0] > 0 and rectified[1] > 0 and all(map(math.isfinite, rectified)):
-        matrix, numbers = "P", rectified
-    else:
-        matrix, numbers = "K", [float(msg.k[index]) for index in (0, 4, 2, 5)]
+    matrix = "P"
+    fx, fy, cx, cy = (float(msg.p[index]) for index in (0, 5, 2, 6))
+    if not (fx > 0 and fy > 0 and all(map(math.isfinite, (fx, fy, cx, cy)))):
+        matrix = "K"
+        fx, fy, cx, cy = (float(msg.k[index]) for index in (0, 4, 2, 5))
     width, height = int(msg.width), int(msg.height)
-    _check(matrix, *numbers, max(width, height))
-    return Intrinsics(*numbers, width, height, matrix, distorted=matrix == "K" and bool(np.any(msg.d)))
+    _check(matrix, fx, fy, cx, cy, max(width, height))
+    return Intrinsics(fx, fy, cx, cy, width, height, matrix, distorted=matrix == "K" and bool(np.any(msg.d)))
 
 
 def _check(matrix: str, fx: float, fy: float, cx: float, cy: float, side: int) -> None:
-    least, most = (limit * side for limit in _FOCAL_PER_SIDE) if side else _FOCAL_PIXELS
-    # Comparisons with NaN are false. A cropped image may have its principal point outside, but not that far.
-    if not (least <= fx <= most and least <= fy <= most and abs(cx) <= most and abs(cy) <= most):
+    shortest, longest = (limit * side for limit in _FOCAL_PER_SIDE) if side else _FOCAL_PIXELS
+    # Comparisons with NaN are false. The principal point of a cropped image may lie outside, but not that far.
+    focal_ok = shortest <= fx <= longest and shortest <= fy <= longest
+    if not (focal_ok and abs(cx) <= longest and abs(cy) <= longest):
         raise MessageError(
             "bad_intrinsics",
-            f"CameraInfo's {matrix} has fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}; in pixels of this image focal "
-            f"lengths lie within {least:g} and {most:g}; calibrate the camera or correct its driver",
+            f"CameraInfo's {matrix} has fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}; focal lengths of this image must "
+            f"be {shortest:g} to {longest:g} pixels; calibrate the camera or correct its driver",
         )

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""hri_msgs/Skeleton2D (ROS4HRI, REP-155): one message is one body, on a topic of its own.
+"""hri_msgs/Skeleton2D (ROS4HRI, REP-155): one body a message, each body on its own topic.
 
-Coordinates are shares of the image's width and height and become pixels here, so a CameraInfo must have told the
-size: shares themselves are squeezed by the image's aspect and cannot be lifted. The 18 points are in an order
-of their own, with left and right of eyes and ears swapped against OpenPose's, and are placed by name. The body's id is
-not in the message but in its topic.
+Coordinates are normalised by the image's width and height. They become pixels here, with the size from CameraInfo:
+normalised coordinates are distorted by the aspect ratio and cannot be lifted. The 18 points have their own order; left
+and right of eyes and ears are swapped against OpenPose's. Points are placed by name. The topic has the body's id.
 """
 
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 
@@ -25,37 +25,41 @@ NAMES = (
 )
 # fmt: on
 _TOPIC = re.compile(r"/humans/bodies/([^/]+)/skeleton2d")
-#: Detectors guess points outside of the image; one that is more than another image away is not worth having.
-_LEAST, _MOST = -1.0, 2.0
+#: Detectors guess points outside the image. Points more than one image size outside are ignored.
+_MIN_COORDINATE, _MAX_COORDINATE = -1.0, 2.0
 
 
-def read(msg, points: int, source: Source) -> Keypoints2D:
-    """Reads one body of a layout with `points` keypoints.
+def read(msg: Any, points: int, source: Source) -> Keypoints2D:
+    """Read one body.
 
-    Field: skeleton[18] with x, y (0..1 from the image's top left corner) and c (0..1; 0 = missing, as in a point that
-    was never filled). Raises MessageError: no_image_size, not_normalised, wrong_skeleton_size, no_common_names.
+    Field: skeleton[18] with x, y (0 to 1 from the image's top left corner) and c (0 to 1). A point with c = 0 is
+    missing, also one that was never filled.
+
+    Raises:
+        MessageError: no_image_size, not_normalised, wrong_skeleton_size, no_common_names.
     """
-    shares = np.array([(point.x, point.y, point.c) for point in msg.skeleton], dtype=np.float64)
-    if len(shares) != len(NAMES):
+    values = np.array([(point.x, point.y, point.c) for point in msg.skeleton], dtype=np.float64)
+    if len(values) != len(NAMES):
         raise MessageError(
             "wrong_skeleton_size",
-            f"the skeleton has {len(shares)} keypoints; hri_msgs/Skeleton2D has {len(NAMES)}, whatever was not seen",
+            f"the skeleton has {len(values)} keypoints; hri_msgs/Skeleton2D needs {len(NAMES)}, with c = 0 for missing "
+            "ones",
         )
-    seen = shares[:, 2] > 0
-    far = ((shares[:, :2] < _LEAST) | (shares[:, :2] > _MOST)).any(axis=1)
-    _check(seen, far)
-    shares[far | ~seen] = np.nan
-    placed = by_name(shares, NAMES, source.names)[None]
+    seen = values[:, 2] > 0
+    far = np.any((values[:, :2] < _MIN_COORDINATE) | (values[:, :2] > _MAX_COORDINATE), axis=1)
+    _check_normalised(seen, far)
+    values[far | ~seen] = np.nan
+    placed = by_name(values, NAMES, source.names)[None]
     return record(placed[..., :2] * _size(source), placed[..., 2], (_body_id(source.topic),), msg.header)
 
 
-def _check(seen: np.ndarray, far: np.ndarray) -> None:
-    """One point may be far off; where most are, they are pixels."""
+def _check_normalised(seen: np.ndarray, far: np.ndarray) -> None:
+    """Refuse a skeleton if most points lie far outside the image: then they are pixels."""
     if 2 * (seen & far).sum() > seen.sum():
         raise MessageError(
             "not_normalised",
-            f"{(seen & far).sum()} of {seen.sum()} keypoints are no shares of the image; hri_msgs has x and y in 0..1, "
-            "so divide pixels by the image's width and height",
+            f"{(seen & far).sum()} of {seen.sum()} keypoints lie far outside 0..1; hri_msgs has normalised "
+            "coordinates, so divide pixels by the image's width and height",
         )
 
 
@@ -63,13 +67,13 @@ def _size(source: Source) -> tuple[int, int]:
     if source.image_size is None or min(source.image_size) <= 0:
         raise MessageError(
             "no_image_size",
-            "hri_msgs has shares of the image, whose width and height no CameraInfo has told yet; publish or record "
+            "hri_msgs has normalised coordinates, and no CameraInfo has given the image size yet; publish or record "
             "that of the detector's camera, and remap `camera_info` to it",
         )
     return source.image_size
 
 
 def _body_id(topic: str) -> str:
-    """The id in /humans/bodies/ID/skeleton2d; '' from any other topic."""
+    """Return the id in /humans/bodies/ID/skeleton2d, or '' for any other topic."""
     found = _TOPIC.search(topic)
     return found[1] if found else ""

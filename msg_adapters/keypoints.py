@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one record every message family becomes, and the one error a bad message raises.
+"""The record that every message family becomes, and the error that a bad message raises.
 
-Shapes: N persons, P keypoints, point-major (N, P, 2). Pixels, x right, y down.
+Shapes: N persons, P keypoints, coordinates last: (N, P, 2). Pixels: x right, y down.
 """
 
 from __future__ import annotations
@@ -9,15 +9,20 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-#: A coordinate beyond this many pixels is no pixel: the point counts as missing.
-ABSURD_PIXELS = 1e6
+#: Largest plausible coordinate in pixels; points beyond it are missing.
+MAX_PIXELS = 1e6
 
 
 class MessageError(ValueError):
-    """A message that cannot be used. ``reason`` is a short slug to count by; the text says what to do."""
+    """A message that cannot be used; the text says what to do.
+
+    Attributes:
+        reason: short slug to count by.
+    """
 
     def __init__(self, reason: str, advice: str) -> None:
         super().__init__(advice)
@@ -25,7 +30,11 @@ class MessageError(ValueError):
 
 
 class WrongPointCount(MessageError):
-    """The message has another number of keypoints than the layout. ``fits(points)`` tells which would do."""
+    """The number of keypoints in a message differs from the layout's.
+
+    Attributes:
+        fits: tells if a layout with the given number of keypoints would fit.
+    """
 
     def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
         super().__init__("wrong_point_count", advice)
@@ -33,25 +42,27 @@ class WrongPointCount(MessageError):
 
 
 def split_persons(total: int, points: int) -> int:
-    """How many persons of `points` keypoints a flat list of `total` keypoints holds.
+    """Return the number of persons in a flat list of `total` keypoints, `points` for each.
 
-    Raises WrongPointCount where it holds no whole number of persons.
+    Raises:
+        WrongPointCount: `total` is not a multiple of `points`.
     """
     if total % points:
         raise WrongPointCount(
-            f"{total} keypoints are no multiple of the {points} of the layout", lambda other: total % other == 0
+            f"{total} keypoints are not a multiple of the layout's {points}", lambda other: total % other == 0
         )
     return total // points
 
 
 @dataclass(frozen=True)
 class Source:
-    """What a reader may need to know beside the message itself.
+    """Facts beside the message that some families need.
 
-    names: of the layout's P keypoints, for families that tell which point is which; () = unknown.
-    image_size: width and height in pixels, for families that normalise by them; None = unknown.
-    topic: that the message came from, for families that put the person's id there; '' = unknown.
-    optical_frame: CameraInfo's frame_id, for families whose header names another frame of the camera; '' = unknown.
+    Attributes:
+        names: names of the layout's P keypoints, for families that name points; () = unknown.
+        image_size: width and height in pixels, for families with normalised coordinates; None = unknown.
+        topic: topic of the message, for families that put the person's id there; '' = unknown.
+        optical_frame: frame_id of CameraInfo, for families with another frame in the header; '' = unknown.
     """
 
     names: tuple[str, ...] = ()
@@ -64,12 +75,13 @@ class Source:
 class Keypoints2D:
     """The 2D keypoints of all persons in one image.
 
-    xy: (N, P, 2) float64 pixels, NaN where missing.
-    confidence: (N, P) float64 in 0..1, 1 where the message has none, 0 where missing.
-    visible: (N, P) bool.
-    ids: N person ids as text, '' where unknown.
-    stamp: nanoseconds, from the message's header.
-    frame_id: the camera's optical frame: what the message's header names, in nearly all families.
+    Attributes:
+        xy: (N, P, 2) float64 pixels, NaN for missing points.
+        confidence: (N, P) float64, 0 to 1; 0 for missing points, 1 if the message has no confidence.
+        visible: (N, P) bool.
+        ids: N person ids as text, '' if unknown.
+        stamp: nanoseconds, from the message's header.
+        frame_id: the camera's optical frame, in nearly all families the header's frame.
     """
 
     xy: np.ndarray
@@ -81,12 +93,12 @@ class Keypoints2D:
 
     @property
     def persons(self) -> int:
-        """How many persons the image shows (N)."""
+        """Number of persons (N)."""
         return self.xy.shape[0]
 
 
 def join(parts: list[Keypoints2D]) -> Keypoints2D:
-    """The persons of several records of one image, in order; stamp and frame are the first one's."""
+    """Concatenate the persons of several records of one image; stamp and frame are those of the first record."""
     return Keypoints2D(
         np.concatenate([part.xy for part in parts]),
         np.concatenate([part.confidence for part in parts]),
@@ -99,10 +111,14 @@ def join(parts: list[Keypoints2D]) -> Keypoints2D:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera without distortion: focal lengths, principal point and image size, all in pixels.
+    """A pinhole camera without distortion.
 
-    matrix: 'P' or 'K', where in CameraInfo they stood: P is of the rectified image, K of the raw one.
-    distorted: they are of a raw image whose distortion is known but not corrected.
+    Attributes:
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point in pixels.
+        width, height: image size in pixels.
+        matrix: 'P' or 'K', CameraInfo's matrix with these values: P for the rectified image, K for the raw image.
+        distorted: whether the image is raw and has known distortion that is not corrected.
     """
 
     fx: float
@@ -115,21 +131,29 @@ class Intrinsics:
     distorted: bool = False
 
 
-def stamp_ns(header) -> int:
-    """The header's stamp in nanoseconds."""
+def stamp_ns(header: Any) -> int:
+    """Return the header's stamp in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-def nobody(points: int, header) -> Keypoints2D:
-    """The record of an image without persons, for a layout of `points` keypoints."""
+def no_persons(points: int, header: Any) -> Keypoints2D:
+    """Return the record of an image without persons, for a layout of `points` keypoints."""
     return record(np.empty((0, points, 2)), None, (), header)
 
 
 def by_name(values: np.ndarray, own: tuple[str, ...], names: tuple[str, ...]) -> np.ndarray:
-    """Q points (..., Q, C) in a family's own order as (..., P, C) of the layout; NaN for points the family lacks.
+    """Reorder points by name from a family's order to the layout's.
 
-    own: Q names, '' for a point that is none of the body's usual ones; names: P of the layout.
-    Raises MessageError no_common_names.
+    Args:
+        values: (..., Q, C) in the family's order.
+        own: Q names of the family's points, '' for a point that no layout has.
+        names: P names of the layout's points.
+
+    Returns:
+        (..., P, C), NaN for points that the family lacks.
+
+    Raises:
+        MessageError: no_common_names.
     """
     here, there = _common(own, names)
     placed = np.full((*values.shape[:-2], len(names), values.shape[-1]), np.nan)
@@ -139,36 +163,42 @@ def by_name(values: np.ndarray, own: tuple[str, ...], names: tuple[str, ...]) ->
 
 @functools.lru_cache(maxsize=64)
 def _common(own: tuple[str, ...], names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the points that both have: in own, in names."""
+    """Return the indices of the common points: in `own` and in `names`."""
     pairs = [(index, names.index(name)) for index, name in enumerate(own) if name in names]
     if not pairs:
         raise MessageError(
             "no_common_names",
-            f"the layout has none of the points that this message names ({', '.join(filter(None, own))}); "
+            f"the layout has none of the message's points ({', '.join(filter(None, own))}); "
             "set the parameter `layout` to one of the same kind of object",
         )
-    return tuple(np.array(pairs).T)
+    here, there = np.array(pairs).T
+    return here, there
 
 
 def as_float64(values: np.ndarray) -> np.ndarray:
-    """A copy; of signalling NaN, which damaged bytes may be, without numpy's warning."""
+    """Return a float64 copy, without numpy's warning about signalling NaN: damaged bytes may hold that."""
     with np.errstate(invalid="ignore"):
         return np.array(values, dtype=np.float64)
 
 
 def record(
-    xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header, present: np.ndarray | None = None
+    xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header: Any, present: np.ndarray | None = None
 ) -> Keypoints2D:
-    """Makes the record from raw arrays: what no camera can have seen becomes missing.
+    """Make the record from raw arrays and mark implausible points as missing.
 
-    xy (N, P, 2) in any real type; confidence (N, P) or None where the message has none; present (N, P) bool
-    or None where the family marks missing points only by their values. A point is missing where `present`
-    says so, where x or y is not finite or beyond ABSURD_PIXELS, or where its confidence is not finite.
-    Confidences are clipped to 0..1: some detectors' peaks reach a little above one.
+    A point is missing if `present` is False, if x or y is not finite or beyond MAX_PIXELS, or if its confidence is
+    not finite. Confidences are clipped to 0..1: peaks of some detectors exceed one slightly.
+
+    Args:
+        xy: (N, P, 2) pixels, any real type.
+        confidence: (N, P), or None if the message has none.
+        ids: N person ids as text, '' if unknown.
+        header: std_msgs/Header.
+        present: (N, P) bool, or None if the family marks missing points by their values only.
     """
     xy = as_float64(xy)
     with np.errstate(invalid="ignore"):
-        visible = (np.abs(xy) <= ABSURD_PIXELS).all(axis=-1)
+        visible = (np.abs(xy) <= MAX_PIXELS).all(axis=-1)
     if present is not None:
         visible &= present
     if confidence is None:

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""opendr_interface/OpenDRPose2D (OpenDR toolkit): whole pixels; one message is one person.
+"""opendr_interface/OpenDRPose2D (OpenDR toolkit): whole pixels, one person a message.
 
-Points are keyed by name and placed by it, so their order and number do not matter. A negative coordinate
-means missing. There is no confidence a keypoint: conf is of the person, and on a scale of its own.
+Points are placed by name, so their order and number do not matter. A negative coordinate means missing. The message
+has no confidence for each keypoint: conf is the person's, on a scale of its own.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from msg_adapters.keypoints import Keypoints2D, MessageError, Source, record
 
 # fmt: off
-#: OpenDR's abbreviations (reference of its Lightweight OpenPose), in the names that layouts use.
+#: OpenDR's abbreviations (reference of its Lightweight OpenPose) -> keypoint names as in layouts.
 NAMES = {
     "nose": "nose", "neck": "neck",
     "r_sho": "right_shoulder", "r_elb": "right_elbow", "r_wri": "right_wrist",
@@ -24,11 +26,14 @@ NAMES = {
 # fmt: on
 
 
-def read(msg, points: int, source: Source) -> Keypoints2D:
-    """Reads one person of a layout with `points` keypoints; points that the layout lacks are left out.
+def read(msg: Any, points: int, source: Source) -> Keypoints2D:
+    """Read one person; ignore points that the layout lacks.
 
-    Fields: pose_id (negative = unknown), keypoint_list[] with kpt_name, x, y. A name that is no abbreviation of
-    OpenDR's is taken as the layout's own. Raises MessageError no_common_names.
+    Fields: pose_id (negative = unknown), keypoint_list[] with kpt_name, x, y. A name that is not an abbreviation of
+    OpenDR is looked up in the layout as it is.
+
+    Raises:
+        MessageError: no_common_names.
     """
     xy = np.full((1, points, 2), np.nan)
     columns = {name: column for column, name in enumerate(source.names)}
@@ -42,8 +47,8 @@ def read(msg, points: int, source: Source) -> Keypoints2D:
         named = ", ".join(keypoint.kpt_name for keypoint in msg.keypoint_list[:5])
         raise MessageError(
             "no_common_names",
-            f"the layout has none of the points of this message ({named} ...); set the parameter `layout` to one "
-            "whose names are the same",
+            f"the layout has none of the message's points ({named} ...); set the parameter `layout` to one with the "
+            "same names",
         )
     person = str(msg.pose_id) if msg.pose_id >= 0 else ""
-    return record(xy, None, (person,), msg.header, present=(xy >= 0).all(axis=-1))
+    return record(xy, None, (person,), msg.header, present=np.all(xy >= 0, axis=-1))

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenPose in its two forms: openpose_ros2_msgs/PoseKeyPointsList and ros_openpose/Frame.
 
-Pixels and a score for every point of a person, in OpenPose's own order, which the number of points tells:
-18 of its COCO model, 25 of BODY_25. Those are placed by name, so they need no layout of their own; any other
-number is taken in the layout's order. (0, 0, 0) is missing. There are no ids.
+Each point of a person has pixels and a score. The number of points tells OpenPose's order: 18 for its COCO model, 25
+for BODY_25. Such points are placed by name, so they need no layout of their own. With any other number, points have
+the layout's order. A point (0, 0, 0) is missing. Persons have no ids.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, Source, WrongPointCount, by_name, nobody, record
+from msg_adapters.keypoints import Keypoints2D, Source, WrongPointCount, by_name, no_persons, record
 
 # fmt: off
 #: The 18 points of OpenPose's COCO model (OpenPose's output format).
@@ -30,12 +32,17 @@ BODY25 = (
 )
 # fmt: on
 _ORDERS = {len(order): order for order in (OPENPOSE18, BODY25)}
+_LAYOUTS = {len(OPENPOSE18): "openpose18", len(BODY25): "body25"}
+
+#: One person's points: (x, y, score) each.
+_Person = list[tuple[float, float, float]]
 
 
-def read_list(msg, points: int, source: Source) -> Keypoints2D:
-    """Reads openpose_ros2_msgs/PoseKeyPointsList: pose_key_points_list[].pose_key_points[] with x, y, score.
+def read_list(msg: Any, points: int, source: Source) -> Keypoints2D:
+    """Read openpose_ros2_msgs/PoseKeyPointsList: pose_key_points_list[].pose_key_points[] with x, y, score.
 
-    Raises MessageError: wrong_point_count, no_common_names.
+    Raises:
+        MessageError: wrong_point_count, no_common_names.
     """
     persons = [
         [(point.x, point.y, point.score) for point in person.pose_key_points] for person in msg.pose_key_points_list
@@ -43,44 +50,45 @@ def read_list(msg, points: int, source: Source) -> Keypoints2D:
     return _read(persons, points, source, msg.header)
 
 
-def read_frame(msg, points: int, source: Source) -> Keypoints2D:
-    """Reads ros_openpose/Frame: persons[].bodyParts[] with score and pixel x, y; hands are left out.
+def read_frame(msg: Any, points: int, source: Source) -> Keypoints2D:
+    """Read ros_openpose/Frame: persons[].bodyParts[] with score and pixel x, y; hands are ignored.
 
-    Raises MessageError: wrong_point_count, no_common_names.
+    Raises:
+        MessageError: wrong_point_count, no_common_names.
     """
     persons = [[(part.pixel.x, part.pixel.y, part.score) for part in _body_parts(person)] for person in msg.persons]
     return _read(persons, points, source, msg.header)
 
 
-def layout_of_list(msg) -> str | None:
-    """openpose18 or body25, by the number of points of the first person that has any; None = neither."""
-    return _named([len(person.pose_key_points) for person in msg.pose_key_points_list])
+def layout_of_list(msg: Any) -> str | None:
+    """Return openpose18 or body25 by the number of points of the first person that has any, else None."""
+    return _layout([len(person.pose_key_points) for person in msg.pose_key_points_list])
 
 
-def layout_of_frame(msg) -> str | None:
-    """The same of the other form."""
-    return _named([len(_body_parts(person)) for person in msg.persons])
+def layout_of_frame(msg: Any) -> str | None:
+    """Return openpose18 or body25 as `layout_of_list` does."""
+    return _layout([len(_body_parts(person)) for person in msg.persons])
 
 
-def _named(counts: list[int]) -> str | None:
-    return {len(OPENPOSE18): "openpose18", len(BODY25): "body25"}.get(next(filter(None, counts), 0))
+def _layout(counts: list[int]) -> str | None:
+    return _LAYOUTS.get(next(filter(None, counts), 0))
 
 
-def _body_parts(person) -> list:
-    """The package is of ROS 1; ROS 2 forbids capitals in a field's name, so whoever ports it renames the field."""
+def _body_parts(person: Any) -> list[Any]:
+    """Return the body parts under either name: ROS 2 forbids capitals in field names, so ports rename the field."""
     return person.bodyParts if hasattr(person, "bodyParts") else person.body_parts
 
 
-def _read(persons: list[list[tuple]], points: int, source: Source, header) -> Keypoints2D:
+def _read(persons: list[_Person], points: int, source: Source, header: Any) -> Keypoints2D:
     if not persons:
-        return nobody(points, header)
+        return no_persons(points, header)
     values = np.stack([_placed(person, points, source.names) for person in persons])
     present = (values != 0).any(axis=-1)
     return record(values[..., :2], values[..., 2], ("",) * len(persons), header, present)
 
 
-def _placed(person: list[tuple], points: int, names: tuple[str, ...]) -> np.ndarray:
-    """One person's (x, y, score) as (P, 3); a person without points is one of whom none is visible."""
+def _placed(person: _Person, points: int, names: tuple[str, ...]) -> np.ndarray:
+    """Return one person's (x, y, score) as (P, 3), all NaN for a person without points."""
     if not person:
         return np.full((points, 3), np.nan)
     order = _ORDERS.get(len(person))

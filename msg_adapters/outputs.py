@@ -1,33 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays to messages, for rclpy classes and rosbags dataclasses alike.
+"""Convert arrays to messages, for rclpy's classes and rosbags' dataclasses alike.
 
-Every writer takes a factory ``make``: ``make(type_name, **fields)`` builds a message and is always given all
-its fields; ``make.octets(data)`` turns bytes into what a uint8[] field of the family wants. ``header`` is a
-std_msgs/Header of the same family and is passed on as it is. Numbers reach messages as Python's own, since
-rclpy publishes garbage for numpy scalars unless its field checks are on.
+Every writer takes a message factory `make` and a std_msgs/Header of the same family, which becomes the message's
+header. N is the number of persons, P the number of keypoints.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
-#: Of the cloud of 3D keypoints.
+from msg_adapters.factory import MessageFactory
+from msg_adapters.palette import SIDE_COLOURS, rgb
+
+#: Fields of the cloud of 3D keypoints.
 POINT_FIELDS = ("x", "y", "z", "confidence", "keypoint", "person_id", "ambiguity", "distance_sigma")
 _FLOAT32 = 7
 _SPHERE_LIST, _LINE_LIST = 7, 5
 _ANNOTATED_POINTS, _ANNOTATED_LINES = 1, 4
 _ADD, _DELETE = 0, 2
 _MARKER_SECONDS = 1
-#: Up to here float32 holds every whole number.
+#: float32 holds every whole number up to this one.
 _LARGEST_ID = 2**24
-
-#: Colours of the sides as (r, g, b): left red and right green, as on ships.
-SIDE_COLOURS = {"left": (0.9, 0.2, 0.2), "right": (0.2, 0.75, 0.3), "": (0.35, 0.55, 0.95)}
 _OBSERVED_ALPHA, _HIDDEN_ALPHA = 1.0, 0.3
+_COLOUR, _FOXGLOVE_COLOUR = "std_msgs/msg/ColorRGBA", "foxglove_msgs/msg/Color"
+
+#: Pairs of keypoint indices.
+Edges = np.ndarray | Sequence[Sequence[int]]
+#: N ids as text ('' = unknown), or N numbers from `id_numbers`.
+Ids = np.ndarray | Sequence[object]
+#: (side, observed) -> colour message.
+_Palette = dict[tuple[str, bool], Any]
 
 
-def pose_array(make, header, points: np.ndarray):
-    """geometry_msgs/PoseArray of points (N, P, 3), person-major, identity orientation."""
+def pose_array(make: MessageFactory, header: Any, points: np.ndarray) -> Any:
+    """Make a geometry_msgs/PoseArray of points (N, P, 3), one person after the other, with identity orientation."""
     identity = _quaternion(make)
     poses = [
         make("geometry_msgs/msg/Pose", position=_point(make, xyz), orientation=identity)
@@ -36,8 +45,8 @@ def pose_array(make, header, points: np.ndarray):
     return make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
 
 
-def body_array(make, header, positions: np.ndarray, quaternions: np.ndarray):
-    """geometry_msgs/PoseArray, one pose a person: positions (N, 3), quaternions (N, 4) as x, y, z, w."""
+def body_array(make: MessageFactory, header: Any, positions: np.ndarray, quaternions: np.ndarray) -> Any:
+    """Make a geometry_msgs/PoseArray with one pose a person: positions (N, 3), quaternions (N, 4) as x, y, z, w."""
     poses = [
         make("geometry_msgs/msg/Pose", position=_point(make, xyz), orientation=_quaternion(make, *xyzw))
         for xyz, xyzw in zip(positions.tolist(), quaternions.tolist())
@@ -45,31 +54,51 @@ def body_array(make, header, positions: np.ndarray, quaternions: np.ndarray):
     return make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
 
 
-def keypoints_cloud(make, header, xy: np.ndarray, confidence: np.ndarray, person_ids):
-    """2D keypoints as the native contract: an organised cloud, height = persons, width = keypoints.
+def keypoints_cloud(make: MessageFactory, header: Any, xy: np.ndarray, confidence: np.ndarray, person_ids: Ids) -> Any:
+    """Make the native cloud of 2D keypoints: organised, height = persons, width = keypoints.
 
-    xy (N, P, 2) pixels, NaN = missing; confidence (N, P); person_ids: N ids as text, numbers or ''.
+    Args:
+        make: message factory.
+        header: std_msgs/Header.
+        xy: (N, P, 2) pixels, NaN = missing.
+        confidence: (N, P).
+        person_ids: N ids.
     """
     persons, points = confidence.shape
     ids = np.broadcast_to(id_numbers(person_ids)[:, None], (persons, points))
     return _cloud(make, header, ("x", "y", "confidence", "person_id"), [xy[..., 0], xy[..., 1], confidence, ids])
 
 
-def points_cloud(make, header, points: np.ndarray, confidence: np.ndarray, ids, ambiguity, distance_sigma):
-    """3D keypoints as an organised cloud, persons x P: x, y, z, confidence, keypoint (index); equal for all points of a
-    person: person_id, ambiguity, distance_sigma.
+def points_cloud(
+    make: MessageFactory,
+    header: Any,
+    points: np.ndarray,
+    confidence: np.ndarray,
+    ids: Ids,
+    ambiguity: np.ndarray,
+    distance_sigma: np.ndarray,
+) -> Any:
+    """Make an organised cloud of 3D keypoints, height = persons, width = keypoints, with the fields POINT_FIELDS.
 
-    See point_values.
+    See `point_values` for the arguments.
     """
     values = point_values(points, confidence, ids, ambiguity, distance_sigma)
     return _cloud(make, header, POINT_FIELDS, list(np.moveaxis(values, -1, 0)))
 
 
-def point_values(points: np.ndarray, confidence: np.ndarray, ids, ambiguity, distance_sigma) -> np.ndarray:
-    """(N, P, 8) float32 in the order of POINT_FIELDS.
+def point_values(
+    points: np.ndarray, confidence: np.ndarray, ids: Ids, ambiguity: np.ndarray, distance_sigma: np.ndarray
+) -> np.ndarray:
+    """Return (N, P, 8) float32 in the order of POINT_FIELDS.
 
-    points (N, P, 3) in the camera's optical frame; confidence (N, P), 0 where the keypoint was not seen; ambiguity (N,)
-    0..1; distance_sigma (N,) metres, NaN where there are none.
+    The field keypoint is the keypoint's index. The last three fields are equal for all points of a person.
+
+    Args:
+        points: (N, P, 3) in the camera's optical frame.
+        confidence: (N, P), 0 for keypoints that were not observed.
+        ids: N ids.
+        ambiguity: (N,), 0 to 1.
+        distance_sigma: (N,) metres, NaN if unknown.
     """
     values = np.empty((*confidence.shape, len(POINT_FIELDS)), "<f4")
     values[..., :3] = points
@@ -80,39 +109,50 @@ def point_values(points: np.ndarray, confidence: np.ndarray, ids, ambiguity, dis
     return values
 
 
-def skeleton_markers(make, header, points: np.ndarray, observed: np.ndarray, edges, sides, thickness: float):
-    """visualization_msgs/MarkerArray of all persons: one LINE_LIST (bones), one SPHERE_LIST (keypoints).
+def skeleton_markers(
+    make: MessageFactory,
+    header: Any,
+    points: np.ndarray,
+    observed: np.ndarray,
+    edges: Edges,
+    sides: Sequence[str],
+    thickness: float,
+) -> Any:
+    """Make a visualization_msgs/MarkerArray of all persons: a LINE_LIST of bones and a SPHERE_LIST of keypoints.
 
-    points (N, P, 3); observed (N, P) bool, what was not observed is drawn faint; edges: pairs of keypoint
-    indices; sides: P of 'left', 'right', ''; thickness of a bone in the units of the points. A bone has the
-    colour of a side where both its ends are of that side.
-    With no person both markers are deleted: viewers complain of empty lists.
+    A bone has the colour of a side if both its ends have that side. Without persons both markers are deleted: viewers
+    complain about empty lists.
+
+    Args:
+        make: message factory.
+        header: std_msgs/Header.
+        points: (N, P, 3).
+        observed: (N, P) bool; hidden points are faint.
+        edges: pairs of keypoint indices.
+        sides: P of 'left', 'right', ''.
+        thickness: of a bone, in the units of the points.
     """
     edges = np.asarray(edges, dtype=int).reshape(-1, 2)
-    bone_sides = [sides[a] if sides[a] == sides[b] else "" for a, b in edges]
+    palette = _palette(make, _COLOUR)
     bones = points[:, edges].reshape(-1, 3)
-    bones_seen = observed[:, edges].all(axis=-1).repeat(2)
-    palette = _palette(make)
-    lines = _marker(
-        make, header, 0, "bones", _LINE_LIST, thickness, bones, _colours(palette, np.repeat(bone_sides, 2), bones_seen)
-    )
-    spheres = _marker(
-        make,
-        header,
-        1,
-        "keypoints",
-        _SPHERE_LIST,
-        2 * thickness,
-        points.reshape(-1, 3),
-        _colours(palette, sides, observed.reshape(-1)),
-    )
+    bone_colours = _colours(palette, _bone_sides(edges, sides), np.all(observed[:, edges], axis=-1), ends=2)
+    lines = _marker(make, header, 0, "bones", _LINE_LIST, thickness, bones, bone_colours)
+    point_colours = _colours(palette, sides, observed)
+    spheres = _marker(make, header, 1, "keypoints", _SPHERE_LIST, 2 * thickness, points.reshape(-1, 3), point_colours)
     return make("visualization_msgs/msg/MarkerArray", markers=[lines, spheres])
 
 
-def body_transforms(make, header, ids, positions: np.ndarray, quaternions: np.ndarray):
-    """tf2_msgs/TFMessage from the header's frame to body_ID (REP-155) of every person that has an id, '' being none.
+def body_transforms(
+    make: MessageFactory, header: Any, ids: Sequence[str], positions: np.ndarray, quaternions: np.ndarray
+) -> Any:
+    """Make a tf2_msgs/TFMessage from the header's frame to body_ID (REP-155) for every person with an id.
 
-    positions (N, 3) metres; quaternions (N, 4) as x, y, z, w.
+    Args:
+        make: message factory.
+        header: std_msgs/Header.
+        ids: N ids, '' = unknown.
+        positions: (N, 3) metres.
+        quaternions: (N, 4) as x, y, z, w.
     """
     transforms = [
         make(
@@ -131,32 +171,45 @@ def body_transforms(make, header, ids, positions: np.ndarray, quaternions: np.nd
     return make("tf2_msgs/msg/TFMessage", transforms=transforms)
 
 
-def image_annotations(make, header, pixels: np.ndarray, observed: np.ndarray, edges, sides):
-    """foxglove_msgs/ImageAnnotations: bones and keypoints of all persons, drawn into the camera's image.
+def image_annotations(
+    make: MessageFactory,
+    header: Any,
+    pixels: np.ndarray,
+    observed: np.ndarray,
+    edges: Edges,
+    sides: Sequence[str],
+) -> Any:
+    """Make foxglove_msgs/ImageAnnotations: bones and keypoints of all persons for the camera's image.
 
-    pixels (N, P, 2), whole numbers at the middle of a pixel as in CameraInfo, NaN where there is nothing to draw;
-    observed (N, P) bool, what was not is drawn faint; edges, sides: see skeleton_markers. Of the message only `points`
-    is given: its other fields are empty, and are not the same in all releases of the package.
+    Only the field `points` is set. The others stay empty, and differ between releases of the package.
+
+    Args:
+        make: message factory.
+        header: std_msgs/Header.
+        pixels: (N, P, 2), NaN for points not to draw. Whole numbers are at the middle of a pixel, as in CameraInfo.
+        observed: (N, P) bool; hidden points are faint.
+        edges: pairs of keypoint indices.
+        sides: P of 'left', 'right', ''.
     """
     edges = np.asarray(edges, dtype=int).reshape(-1, 2)
+    palette = _palette(make, _FOXGLOVE_COLOUR)
     ends = pixels[:, edges]
-    drawn = np.isfinite(ends).all(axis=(2, 3))
-    palette = {key: _colour(make, rgb, alpha, "foxglove_msgs/msg/Color") for key, rgb, alpha in _tones()}
-    bone_sides = [sides[a] if sides[a] == sides[b] else "" for a, b in edges]
-    bones_seen = observed[:, edges].all(axis=-1)
-    shown = np.isfinite(pixels).all(axis=2)
-    of_bones = [palette[bone_sides[bone], bool(bones_seen[n, bone])] for n, bone in np.argwhere(drawn)]
-    of_points = [palette[str(sides[point]), bool(observed[n, point])] for n, point in np.argwhere(shown)]
-    lines = _annotation(make, header, _ANNOTATED_LINES, ends[drawn].reshape(-1, 2), of_bones, 2.0)
-    dots = _annotation(make, header, _ANNOTATED_POINTS, pixels[shown], of_points, 6.0)
+    bones_drawn = np.isfinite(ends).all(axis=(2, 3))
+    bones_observed = np.all(observed[:, edges], axis=-1)
+    bone_sides = _bone_sides(edges, sides)
+    bone_colours = [palette[bone_sides[bone], bool(bones_observed[n, bone])] for n, bone in np.argwhere(bones_drawn)]
+    points_drawn = np.isfinite(pixels).all(axis=2)
+    point_colours = [palette[str(sides[point]), bool(observed[n, point])] for n, point in np.argwhere(points_drawn)]
+    lines = _annotation(make, header, _ANNOTATED_LINES, ends[bones_drawn].reshape(-1, 2), bone_colours, 2.0)
+    dots = _annotation(make, header, _ANNOTATED_POINTS, pixels[points_drawn], point_colours, 6.0)
     return make("foxglove_msgs/msg/ImageAnnotations", points=[lines, dots])
 
 
-def id_numbers(ids) -> np.ndarray:
-    """Person ids as numbers a float32 field can carry: -1 for '', the row for an id that is no whole number.
+def id_numbers(ids: Ids) -> np.ndarray:
+    """Return person ids as numbers that a float32 field can hold.
 
-    Exact up to 2^24; a larger id is replaced by its row too, since two persons would share its rounding.
-    An array of such numbers is passed on as it is.
+    The number is -1 for ''. It is the person's row for an id that is not a whole number, or that is above 2^24: two
+    persons could share its rounded value. An array of numbers is returned as it is.
     """
     if isinstance(ids, np.ndarray):
         return ids
@@ -167,13 +220,13 @@ def _id_number(text: str, row: int) -> int:
     if text == "":
         return -1
     digits = text.lstrip("0") or "0"
-    # The length first: Python refuses to read a number of thousands of digits.
+    # Check the length first: Python refuses to convert thousands of digits.
     known = digits.isdecimal() and len(digits) <= len(str(_LARGEST_ID)) and int(digits) <= _LARGEST_ID
     return int(digits) if known else row
 
 
-def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray]):
-    """An organised float32 PointCloud2 of columns, each (height, width)."""
+def _cloud(make: MessageFactory, header: Any, names: tuple[str, ...], columns: list[np.ndarray]) -> Any:
+    """Make an organised float32 PointCloud2 of columns, each (height, width)."""
     data = np.stack(columns, axis=-1).astype("<f4")
     height, width, count = data.shape
     fields = [
@@ -194,8 +247,15 @@ def _cloud(make, header, names: tuple[str, ...], columns: list[np.ndarray]):
     )
 
 
-def _marker(make, header, index: int, name: str, kind: int, size: float, points: np.ndarray, colours: list):
-    """One marker of a packed kind. It expires by itself when no further frame comes."""
+def _bone_sides(edges: np.ndarray, sides: Sequence[str]) -> list[str]:
+    """Return the side of each bone: that of both its ends, or '' if they differ."""
+    return [str(sides[a]) if sides[a] == sides[b] else "" for a, b in edges]
+
+
+def _marker(
+    make: MessageFactory, header: Any, index: int, name: str, kind: int, size: float, points: np.ndarray, colours: list
+) -> Any:
+    """Make one marker of a list type. It expires if no further frame comes."""
     seconds = make("builtin_interfaces/msg/Duration", sec=_MARKER_SECONDS, nanosec=0)
     zero = make("builtin_interfaces/msg/Time", sec=0, nanosec=0)
     nothing = make("std_msgs/msg/Header", stamp=zero, frame_id="")
@@ -208,7 +268,7 @@ def _marker(make, header, index: int, name: str, kind: int, size: float, points:
         action=_ADD if len(points) else _DELETE,
         pose=make("geometry_msgs/msg/Pose", position=_point(make, (0.0, 0.0, 0.0)), orientation=_quaternion(make)),
         scale=_vector(make, *(3 * (float(size),))),
-        color=_colour(make, SIDE_COLOURS[""], _OBSERVED_ALPHA),
+        color=_colour(make, _COLOUR, SIDE_COLOURS[""], _OBSERVED_ALPHA),
         lifetime=seconds,
         frame_locked=False,
         points=[_point(make, xyz) for xyz in points.tolist()],
@@ -223,20 +283,26 @@ def _marker(make, header, index: int, name: str, kind: int, size: float, points:
     )
 
 
-def _palette(make) -> dict:
-    """(side, observed) -> colour message; shared by all points, which is what makes many points cheap."""
-    return {key: _colour(make, rgb, alpha) for key, rgb, alpha in _tones()}
+def _palette(make: MessageFactory, kind: str) -> _Palette:
+    """Return (side, observed) -> colour message. All points share these messages, so many points are cheap."""
+    alphas = {True: _OBSERVED_ALPHA, False: _HIDDEN_ALPHA}
+    return {
+        (side, observed): _colour(make, kind, colour, alpha)
+        for side, colour in SIDE_COLOURS.items()
+        for observed, alpha in alphas.items()
+    }
 
 
-def _tones():
-    """(side, observed), its colour, its opacity."""
-    for side, rgb in SIDE_COLOURS.items():
-        yield (side, True), rgb, _OBSERVED_ALPHA
-        yield (side, False), rgb, _HIDDEN_ALPHA
+def _colours(palette: _Palette, sides: Sequence[str], observed: np.ndarray, ends: int = 1) -> list:
+    """Return the colours of all persons, `ends` for each of the parts with these sides; observed (N, parts)."""
+    rows = observed.tolist()
+    return [palette[str(side), seen] for row in rows for side, seen in zip(sides, row) for _ in range(ends)]
 
 
-def _annotation(make, header, kind: int, pixels: np.ndarray, colours: list, thickness: float):
-    # The origin is the corner of the first pixel there, its middle in CameraInfo.
+def _annotation(
+    make: MessageFactory, header: Any, kind: int, pixels: np.ndarray, colours: list, thickness: float
+) -> Any:
+    # Foxglove's origin is the corner of the first pixel, CameraInfo's its middle.
     corner = (pixels + 0.5).tolist()
     return make(
         "foxglove_msgs/msg/PointsAnnotation",
@@ -248,22 +314,18 @@ def _annotation(make, header, kind: int, pixels: np.ndarray, colours: list, thic
     )
 
 
-def _colours(palette: dict, sides, observed: np.ndarray) -> list:
-    """One colour a point; `sides` is of one person and repeats for each."""
-    return [palette[str(sides[index % len(sides)]), seen] for index, seen in enumerate(observed.tolist())]
+def _colour(make: MessageFactory, kind: str, colour: str, alpha: float) -> Any:
+    red, green, blue = rgb(colour)
+    return make(kind, r=red, g=green, b=blue, a=alpha)
 
 
-def _colour(make, rgb, alpha: float, kind: str = "std_msgs/msg/ColorRGBA"):
-    return make(kind, r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
-
-
-def _point(make, xyz):
+def _point(make: MessageFactory, xyz: Sequence[float]) -> Any:
     return make("geometry_msgs/msg/Point", x=xyz[0], y=xyz[1], z=xyz[2])
 
 
-def _vector(make, x: float, y: float, z: float):
+def _vector(make: MessageFactory, x: float, y: float, z: float) -> Any:
     return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def _quaternion(make, x: float = 0.0, y: float = 0.0, z: float = 0.0, w: float = 1.0):
+def _quaternion(make: MessageFactory, x: float = 0.0, y: float = 0.0, z: float = 0.0, w: float = 1.0) -> Any:
     return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One palette for messages, pictures and films: left is blue, right is orange, which every common colour vision tells
-apart."""
+"""The palette of messages, pictures and films: left is blue, right is orange, also for colour-blind viewers."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adapters of other packages: found by an entry point, loaded with the first message of their type, never trusted.
+"""Adapters of other packages: found by entry points, loaded with the first message of their type, never trusted.
 
-A package declares, in the group GROUP, an entry point named like the message type and pointing to an Adapter; how, with
-a complete example, is in docs/adapters.md. What such an adapter does wrong costs its messages, which are dropped with a
-reason that names its package, and nothing else.
+A package declares an entry point in the group GROUP. Its name is the message type; its object is an Adapter.
+docs/how_to/write_an_adapter.md has a complete example. Faults of such an adapter cost only its own messages. These are
+dropped with a reason that names the package.
 """
 
 from __future__ import annotations
@@ -13,10 +13,16 @@ import logging
 import re
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from msg_adapters.keypoints import ABSURD_PIXELS, Keypoints2D, MessageError, Source, WrongPointCount
+from msg_adapters.keypoints import MAX_PIXELS, Keypoints2D, MessageError, Source, WrongPointCount
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+_T = TypeVar("_T")
 
 GROUP = "paul_ros.msg_adapters"
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*/msg/[A-Za-z]\w*")
@@ -26,22 +32,23 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Adapter:
-    """How the messages of one type are read.
+    """Reader of the messages of one type.
 
-    read(msg, points, source): as Keypoints2D of a layout of `points` keypoints; raises MessageError.
-    layout(msg): the shipped layout whose points the messages are, by what this one says; None = it does not say.
-    one_person: a message is one person, and those of one stamp are of one image.
+    Attributes:
+        read: read(msg, points, source) returns Keypoints2D for a layout of `points` keypoints or raises MessageError.
+        layout: layout(msg) returns the name of the shipped layout that the message's points have, None = unknown.
+        one_person: whether a message holds one person; messages with equal stamps are then persons of one image.
     """
 
-    read: Callable[[object, int, Source], Keypoints2D]
-    layout: Callable[[object], str | None] = lambda _: None
+    read: Callable[[Any, int, Source], Keypoints2D]
+    layout: Callable[[Any], str | None] = lambda _: None
     one_person: bool = False
 
 
-class Adapters(Mapping):
-    """Type name -> Adapter: the shipped ones, then those of other packages, which are looked for when first asked for.
+class Adapters(Mapping[str, "Adapter | Plugin"]):
+    """Type name -> Adapter: the shipped adapters, then those of other packages.
 
-    A package cannot take a shipped type over: its adapter is left aside with a warning.
+    Other packages are searched on first use. Their adapters for shipped types are ignored with a warning.
     """
 
     def __init__(self, shipped: dict[str, Adapter]) -> None:
@@ -58,52 +65,52 @@ class Adapters(Mapping):
 
     @functools.cached_property
     def _others(self) -> dict[str, Plugin]:
-        found: dict[str, list] = {}
+        found: dict[str, list[EntryPoint]] = {}
         for point in _entry_points():
             if point.name in self._shipped:
-                _log.warning("%s has an adapter for %s, which paul_ros reads itself; not used", _of(point), point.name)
+                _log.warning("%s has an adapter for %s; ignored, paul_ros has its own", _of(point), point.name)
             elif not _TYPE_NAME.fullmatch(point.name):
-                _log.warning("%s has an adapter for %s, which is no PACKAGE/msg/NAME; not used", _of(point), point.name)
+                _log.warning("%s has an adapter for %s; ignored, name it PACKAGE/msg/NAME", _of(point), point.name)
             else:
                 found.setdefault(point.name, []).append(point)
         return {name: Plugin(name, points) for name, points in found.items()}
 
 
-class OnePerson(Container):
-    """The types whose message is one person: those of one stamp are of one image."""
+class OnePerson(Container[str]):
+    """The types with one person a message: messages with equal stamps are persons of one image."""
 
     def __init__(self, adapters: Adapters) -> None:
         self._adapters = adapters
 
     def __contains__(self, type_name: object) -> bool:
-        return type_name in self._adapters and self._adapters[type_name].one_person
+        return isinstance(type_name, str) and type_name in self._adapters and self._adapters[type_name].one_person
 
 
 class Plugin:
-    """Stands for the Adapter of another package and says whose fault it is where that cannot be used.
+    """The Adapter of another package, guarded: every error names that package.
 
-    Raises MessageError: broken_adapter (it cannot be loaded), adapter_failed (it raised something else than a
-    MessageError, or its result is no record of the message).
+    The reasons of its MessageErrors: broken_adapter (it cannot be loaded) and adapter_failed (it raised anything but a
+    MessageError, or its result is malformed).
     """
 
-    def __init__(self, type_name: str, points: list) -> None:
+    def __init__(self, type_name: str, entry_points: list[EntryPoint]) -> None:
         self._type_name = type_name
-        self._points = points
+        self._entry_points = entry_points
 
-    def read(self, msg, points: int, source: Source) -> Keypoints2D:
-        """See Adapter."""
+    def read(self, msg: Any, points: int, source: Source) -> Keypoints2D:
+        """Read a message as `Adapter.read` does."""
         return self._ask(lambda adapter: _checked(adapter.read(msg, points, source), points))
 
-    def layout(self, msg) -> str | None:
-        """See Adapter."""
-        return self._ask(lambda adapter: _name(adapter.layout(msg)))
+    def layout(self, msg: Any) -> str | None:
+        """Return a layout's name as `Adapter.layout` does."""
+        return self._ask(lambda adapter: _checked_name(adapter.layout(msg)))
 
     @property
     def one_person(self) -> bool:
-        """See Adapter; of one that cannot be loaded nothing is known."""
+        """Has each message one person? False if the adapter cannot be loaded."""
         return isinstance(self._loaded, Adapter) and bool(self._loaded.one_person)
 
-    def _ask(self, question: Callable[[Adapter], object]):
+    def _ask(self, question: Callable[[Adapter], _T]) -> _T:
         if isinstance(self._loaded, str):
             raise MessageError("broken_adapter", self._loaded)
         try:
@@ -114,43 +121,44 @@ class Plugin:
             raise MessageError(str(error.reason), str(error)) from error
         except (Exception, SystemExit) as error:
             raise MessageError(
-                "adapter_failed", f"{self._who()} failed ({_line(error)}); tell its authors, or uninstall it"
+                "adapter_failed", f"{self._who()} failed ({_line(error)}); report it to its authors, or uninstall it"
             ) from error
 
     @functools.cached_property
     def _loaded(self) -> Adapter | str:
-        """The adapter, or why there is none."""
-        if len(self._points) > 1:
-            packages = " and ".join(map(_of, self._points))
+        """The adapter, or the text of the error if it cannot be loaded."""
+        if len(self._entry_points) > 1:
+            packages = " and ".join(map(_of, self._entry_points))
             return f"{packages} all have an adapter for {self._type_name}; uninstall all but one"
         try:
-            adapter = self._points[0].load()
+            adapter = self._entry_points[0].load()
         except (Exception, SystemExit) as error:
-            return f"{self._who()} cannot be loaded ({_line(error)}); mend or uninstall it"
+            return f"{self._who()} cannot be loaded ({_line(error)}); repair or uninstall it"
         if not isinstance(adapter, Adapter):
-            return f"{self._who()} is a {type(adapter).__name__}, not a msg_adapters.Adapter; mend or uninstall it"
+            return f"{self._who()} is a {type(adapter).__name__}, not a msg_adapters.Adapter; repair or uninstall it"
         return adapter
 
     def _who(self) -> str:
-        return f"the adapter for {self._type_name} of {_of(self._points[0])}"
+        return f"the adapter for {self._type_name} of {_of(self._entry_points[0])}"
 
 
-def _entry_points() -> list:
-    """One of each package that has some."""
-    from importlib import metadata  # a tenth of the node's start, and mostly not needed
+def _entry_points() -> list[EntryPoint]:
+    from importlib import metadata  # its import takes a tenth of the node's start
 
     try:
         return list(metadata.entry_points(group=GROUP))
-    except Exception as error:  # one damaged package among all that are installed is enough
-        _log.warning("adapters of other packages cannot be looked for (%s)", _line(error))
+    except Exception as error:  # any damaged package in the environment raises
+        _log.warning("adapters of other packages are ignored (%s); reinstall the damaged package", _line(error))
         return []
 
 
-def _of(point) -> str:
+def _of(point: EntryPoint) -> str:
+    """Return the package of an entry point, as text."""
     return f"the Python package {point.dist.name} {point.dist.version}" if point.dist else point.value
 
 
 def _line(error: BaseException) -> str:
+    """Return an error's type and text on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
@@ -161,16 +169,16 @@ def _fits(error: WrongPointCount, points: int) -> bool:
         return False
 
 
-def _name(layout: str | None) -> str | None:
+def _checked_name(layout: object) -> str | None:
     if not (layout is None or isinstance(layout, str)):
-        raise TypeError(f"layout gave a {type(layout).__name__}, not a name or None")
+        raise TypeError(f"layout returned a {type(layout).__name__}, not a name or None")
     return layout
 
 
-def _checked(keypoints: Keypoints2D, points: int) -> Keypoints2D:
-    """Raises TypeError or ValueError where this is not what Keypoints2D says."""
+def _checked(keypoints: object, points: int) -> Keypoints2D:
+    """Return the record; raise TypeError or ValueError if it violates the contract of Keypoints2D."""
     if not isinstance(keypoints, Keypoints2D):
-        raise TypeError(f"read gave a {type(keypoints).__name__}, not a Keypoints2D")
+        raise TypeError(f"read returned a {type(keypoints).__name__}, not a Keypoints2D")
     persons = len(keypoints.ids)
     wanted = {
         "xy": ("f", (persons, points, 2)),
@@ -180,12 +188,12 @@ def _checked(keypoints: Keypoints2D, points: int) -> Keypoints2D:
     for name, (kind, shape) in wanted.items():
         array = np.asarray(getattr(keypoints, name))
         if array.shape != shape or array.dtype.kind != kind:
-            raise ValueError(f"{name} is {array.dtype} {array.shape}; of {persons} ids it must be {kind} {shape}")
-    seen = keypoints.xy[keypoints.visible]
-    sure = keypoints.confidence[keypoints.visible]
+            raise ValueError(f"{name} is {array.dtype} {array.shape}; with {persons} ids it must be {kind} {shape}")
+    xy = keypoints.xy[keypoints.visible]
+    confidence = keypoints.confidence[keypoints.visible]
     # Comparisons with NaN are false.
-    if not ((np.abs(seen) <= ABSURD_PIXELS).all() and ((sure >= 0) & (sure <= 1)).all()):
-        raise ValueError("a visible point has no pixels, or a confidence outside 0..1; make the result with record()")
+    if not ((np.abs(xy) <= MAX_PIXELS).all() and ((confidence >= 0) & (confidence <= 1)).all()):
+        raise ValueError("a visible point has no pixels or a confidence outside 0..1; make the result with record()")
     if not (type(keypoints.stamp) is int and all(type(name) is str for name in (*keypoints.ids, keypoints.frame_id))):
         raise TypeError("stamp must be an int, ids and frame_id text; make the result with record()")
     return keypoints

@@ -1,47 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""sensor_msgs/PointCloud2 as 2D keypoints: the native contract.
+"""sensor_msgs/PointCloud2 as 2D keypoints: the native message type.
 
-Organised (height = persons, width = keypoints) or flat (height 1, width a multiple of the keypoints,
-person-major). Fields x, y in pixels, optional confidence 0..1, optional person_id; NaN = missing.
-Offsets, types, steps and endianness are the message's own; none is assumed.
+A cloud is organised (height = persons, width = keypoints) or flat (height 1, one person after the other). Fields: x, y
+in pixels, optional confidence (0 to 1), optional person_id; NaN = missing. Offsets, types, steps and byte order are
+read from the message.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, MessageError, Source, WrongPointCount, as_float64, record, split_persons
+from msg_adapters.keypoints import (
+    Keypoints2D,
+    MessageError,
+    Source,
+    WrongPointCount,
+    as_float64,
+    no_persons,
+    record,
+    split_persons,
+)
 
 #: sensor_msgs/PointField datatype -> numpy type without byte order.
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
-def read(msg, points: int, _source: Source) -> Keypoints2D:
-    """Reads a cloud of keypoints whose layout has `points` of them; an empty cloud is zero persons.
+def read(msg: Any, points: int, _source: Source) -> Keypoints2D:
+    """Read a cloud of 2D keypoints; an empty cloud is an image without persons.
 
-    Raises MessageError: wrong_fields, not_2d, wrong_steps, truncated_data, wrong_point_count.
+    Raises:
+        MessageError: wrong_fields, not_2d, wrong_steps, truncated_data, wrong_point_count.
     """
     if msg.height == 0 or msg.width == 0:
-        return record(np.empty((0, points, 2)), None, (), msg.header)
-    # Sizes first: a structured type of an absurd point_step cannot even be made.
+        return no_persons(points, msg.header)
+    # Check sizes first: numpy cannot make a structured type with an absurd point_step.
     row_step = _row_step(msg)
     dtype = _point_type(msg)
-    cloud = np.ndarray((msg.height, msg.width), dtype, buffer=msg.data, strides=(row_step, msg.point_step))
+    cloud: np.ndarray = np.ndarray((msg.height, msg.width), dtype, buffer=msg.data, strides=(row_step, msg.point_step))
     cloud = _persons_first(cloud, points)
+    names = dtype.names or ()
     xy = np.stack([cloud["x"], cloud["y"]], axis=-1)
-    confidence = cloud["confidence"] if "confidence" in dtype.names else None
-    ids = _ids(cloud["person_id"]) if "person_id" in dtype.names else ("",) * len(cloud)
+    confidence = cloud["confidence"] if "confidence" in names else None
+    ids = _ids(cloud["person_id"]) if "person_id" in names else ("",) * len(cloud)
     return record(xy, confidence, ids, msg.header)
 
 
-def _point_type(msg) -> np.dtype:
-    """The structured type of one point: only the fields that are read, where the message says they lie."""
+def _point_type(msg: Any) -> np.dtype:
+    """Return the structured type of one point with the needed fields only, at the message's offsets."""
     fields = {field.name: field for field in msg.fields}
     if "x" not in fields or "y" not in fields:
         raise MessageError(
             "wrong_fields",
-            f"the cloud has the fields {_listed(fields)}; 2D keypoints need "
-            "x and y in pixels, and may have confidence and person_id",
+            f"the cloud has the fields {', '.join(fields) or 'none'}; send x and y in pixels, optionally confidence "
+            "and person_id",
         )
     if "z" in fields:
         raise MessageError(
@@ -67,24 +80,24 @@ def _point_type(msg) -> np.dtype:
     )
 
 
-def _format(field) -> str:
-    """The numpy type of one field. A count of 0 is taken as 1: some publishers leave it unset."""
+def _format(field: Any) -> str:
+    """Return the numpy type of one field. A count of 0 is read as 1: some publishers leave it unset."""
     form = _DATATYPES.get(field.datatype)
     if form is None or field.count > 1:
         raise MessageError(
             "wrong_fields",
-            f"field {field.name} has datatype {field.datatype} and count "
-            f"{field.count}; it must be one number of a PointField datatype 1..8",
+            f"field {field.name} has datatype {field.datatype} and count {field.count}; send one number of a "
+            "PointField datatype 1..8",
         )
     if field.name == "confidence" and form[0] != "f":
         raise MessageError("wrong_fields", "field confidence is an integer; send it as float32 in 0..1")
     return form
 
 
-def _row_step(msg) -> int:
-    """The bytes from row to row, once it is sure that all rows lie within the data."""
+def _row_step(msg: Any) -> int:
+    """Return the number of bytes from row to row, after a check that all rows lie within the data."""
     row_bytes = msg.width * msg.point_step
-    # A single row needs no row_step, and many publishers of flat clouds leave it 0.
+    # Many publishers of flat clouds leave row_step 0, and a single row does not need it.
     row_step = row_bytes if msg.height == 1 else msg.row_step
     if row_step < row_bytes:
         raise MessageError(
@@ -103,7 +116,7 @@ def _row_step(msg) -> int:
 
 
 def _persons_first(cloud: np.ndarray, points: int) -> np.ndarray:
-    """The (height, width) cloud as (persons, points)."""
+    """Return the (height, width) cloud as (persons, points)."""
     height, width = cloud.shape
     if height == 1:
         return cloud.reshape(split_persons(width, points), points)
@@ -115,12 +128,8 @@ def _persons_first(cloud: np.ndarray, points: int) -> np.ndarray:
 
 
 def _ids(column: np.ndarray) -> tuple[str, ...]:
-    """One id a person from the (N, P) person_id field: the first number that is no NaN and not negative."""
+    """Return one id a person from the (N, P) field person_id: the first finite number that is not negative."""
     column = as_float64(column)
     known = np.isfinite(column) & (column >= 0)
     first = np.take_along_axis(column, known.argmax(axis=1)[:, None], axis=1)[:, 0]
     return tuple(f"{value:.0f}" if is_known else "" for value, is_known in zip(first, known.any(axis=1)))
-
-
-def _listed(fields: dict) -> str:
-    return ", ".join(fields) or "none"

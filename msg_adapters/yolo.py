@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""yolo_msgs/DetectionArray (yolo_ros): pixels, ids where tracking is on.
+"""yolo_msgs/DetectionArray (yolo_ros): pixels, ids if tracking is on.
 
-A detection's keypoint list is sparse and its ids are 1-based: a point is placed by its id, never by its
-position. Exactly (0, 0) is the detector's way to say missing.
+A detection's keypoint list is sparse and its ids count from 1. Points are placed by id, never by position in the list.
+A point at exactly (0, 0) is missing.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from msg_adapters.keypoints import Keypoints2D, MessageError, Source, WrongPointCount, record
 
 
-def read(msg, points: int, _source: Source) -> Keypoints2D:
-    """Reads detections as persons of a layout with `points` keypoints.
+def read(msg: Any, points: int, _source: Source) -> Keypoints2D:
+    """Read detections; one without keypoints is a person without visible points.
 
-    A detection without keypoints is a person of whom no point is visible.
-    Raises MessageError: wrong_point_count (an id beyond the layout), wrong_keypoint_id (an id below 1).
+    Raises:
+        MessageError: wrong_point_count (an id beyond the layout), wrong_keypoint_id (an id below 1).
     """
     persons = len(msg.detections)
     xy = np.zeros((persons, points, 2))
@@ -31,9 +33,12 @@ def read(msg, points: int, _source: Source) -> Keypoints2D:
 
 
 def _column(keypoint_id: int, points: int) -> int:
-    """The layout's column of a 1-based keypoint id."""
+    """Return the layout's column of a 1-based keypoint id."""
     if keypoint_id < 1:
-        raise MessageError("wrong_keypoint_id", f"keypoint id {keypoint_id}; yolo_msgs counts from 1")
+        raise MessageError(
+            "wrong_keypoint_id",
+            f"a keypoint has the id {keypoint_id}; yolo_msgs counts from 1, correct the detector",
+        )
     if keypoint_id > points:
         raise WrongPointCount(
             f"keypoint id {keypoint_id} is beyond the {points} keypoints of the layout",

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A message package generated and compiled with the tools in the environment's own wheels: ROS' generators, cc and c++.
+"""Generate and compile a message package with the generators of the ROS wheels and a C and C++ compiler.
 
-This is what `rosidl_generate_interfaces` does for Python, less the type supports that rclpy with Fast DDS does not ask
-for; the wheels lack what its CMake files need (rosidl_core_generators), so the generators are called one by one.
+CMake's `rosidl_generate_interfaces` does the same for Python. The wheels lack its dependency rosidl_core_generators, so
+this module calls the generators one by one. It omits type supports that rclpy with Fast DDS does not use.
 
     python test/compiled_messages.py yolo_msgs FOLDER    # FOLDER goes on PYTHONPATH
 """
@@ -33,7 +33,7 @@ _RUNTIME = ("rosidl_runtime_c", *_SUPPORTS[2:], "fastcdr", "rcutils")
 
 
 def lacking() -> str:
-    """What this machine lacks to compile a package; '' = nothing."""
+    """Return the tools that this machine lacks to compile a package, '' if none."""
     if not (PREFIX / "include/rosidl_runtime_c").is_dir() or not find_spec("rosidl_generator_py"):
         return "ROS' message generators and headers, which come with the wheels of rclpy"
     if not (Path(sysconfig.get_path("include")) / "Python.h").exists():
@@ -43,7 +43,7 @@ def lacking() -> str:
 
 
 def build(package: str, folder: Path, definitions: dict[str, str] = DEFINITIONS) -> None:
-    """Puts the importable package and its libraries into `folder`; raises CalledProcessError if it does not compile."""
+    """Put the importable package and its libraries into `folder`; raise CalledProcessError if it does not compile."""
     work = folder / f"{package}_build"
     python, *others = generate(package, work, definitions)
     sources = [file for part in (python, *others) for file in sorted(part.rglob("*.c*"))]
@@ -51,7 +51,7 @@ def build(package: str, folder: Path, definitions: dict[str, str] = DEFINITIONS)
         objects = dict(zip(sources, pool.map(lambda source: _compile(source, work), sources)))
     home = folder / package
     shutil.copytree(python, home, ignore=shutil.ignore_patterns("*.c", "*.o"))
-    # The type supports are looked up by these names, and found because the extension has them loaded.
+    # The type supports are looked up by these names; the extension loads them.
     library, twin = (folder / f"lib{package}__rosidl_typesupport_{kind}_c.so" for kind in ("fastrtps", "introspection"))
     _link(library, [out for source, out in objects.items() if python not in source.parents])
     _link(twin, [library])
@@ -67,7 +67,7 @@ def _link(out: Path, parts: list[Path]) -> None:
 
 
 def generate(package: str, work: Path, definitions: dict[str, str]) -> list[Path]:
-    """Makes every source of the package; the folders of the Python part and of the C part."""
+    """Generate all sources of the package; return the folders of the Python part and of the C part."""
     from rosidl_adapter.msg import convert_msg_to_idl
     from rosidl_generator_c import generate_c
     from rosidl_generator_py import generate_py

@@ -1,37 +1,133 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared by all tests: an isolated ROS domain with field checks on, and both families of message classes."""
+"""Shared by all tests: markers, an isolated ROS domain with field checks on, and both families of message classes."""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import tempfile
+from pathlib import Path
+from typing import IO
 
-# Before any test imports rclpy, and inherited by the processes that tests start.
+_LOCKS: list[IO] = []
+
+
+def _free_domain() -> int:
+    """Return a ROS domain that no other test process on this machine uses, locked as long as this process lives."""
+    for domain in range(1, 101):
+        try:
+            file = open(Path(tempfile.gettempdir()) / f"paul_ros_test_domain_{domain}.lock", "w")
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # locked, or the file of another user
+            continue
+        _LOCKS.append(file)
+        return domain
+    raise RuntimeError("other tests use all ROS domains from 1 to 100; end them")
+
+
+# Set before any test imports rclpy; processes that tests start inherit it.
 os.environ.update(
     ROS_PYTHON_CHECK_FIELDS="1",
     ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
     RMW_IMPLEMENTATION="rmw_fastrtps_cpp",
-    ROS_DOMAIN_ID=str(1 + os.getpid() % 100),
+    ROS_DOMAIN_ID=str(_free_domain()),
 )
 
 import array
+import functools
 import importlib
+import importlib.util
 import signal
 import subprocess
 import sys
-from pathlib import Path
+from collections.abc import Iterator
 
+import import_graph
 import numpy as np
 import pytest
 from foreign_messages import DEFINITIONS
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROOT = Path(__file__).resolve().parent.parent
-#: The command of the node's process.
-LIFTER = [sys.executable, "-m", "paul_ros.ros.lifter_process"]
+_VENV = ROOT / ".venv"
+#: Whether this Python is the one that the Makefile sets up.
+IN_VENV = _VENV.exists() and os.path.samefile(sys.prefix, _VENV)
+
+# --- which tests run where
+
+#: Marker -> the fixtures, modules and tests that get it. `make test-fast` runs the tests without any marker.
+MARKERS = {
+    "dds": {"ros", "start_lifter", "test_demo", "test_benchmark_node"},
+    "install": {"install", "installed", "compiled"},
+    "slow": {"test_no_search_finds_a_better_pose", "test_onp_docs"},
+}
+#: Packages that a robot may lack. Test modules that import a missing one are not collected.
+OPTIONAL = ("torch", "rosbags", "mcap", "matplotlib", "rich", "tqdm", "scipy", "hypothesis", "catkin_pkg")
+#: Imported late by paul_ros.offline.bag.
+BAGS = {"rosbags", "mcap"}
+MISSING = {package for package in OPTIONAL if importlib.util.find_spec(package) is None}
+
+
+@functools.cache
+def packages_of(module: str) -> set[str]:
+    """Return the foreign packages that a test module needs, itself or through others."""
+    reached = import_graph.reached([module])
+    return {name.partition(".")[0] for name in reached} | (BAGS if "paul_ros.offline.bag" in reached else set())
+
+
+_FILES = sorted(Path(__file__).parent.glob("test_*.py"))
+collect_ignore = [file.name for file in _FILES if MISSING and packages_of(file.stem) & MISSING]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark each test by its fixtures, its module and its name, and by whether the module loads torch.
+
+    With pytest-xdist, all tests that start nodes or install run in one worker: the demo chooses a domain of its own,
+    which may be that of another worker. The tests of any other module stay together too, with the module's fixtures.
+    """
+    for item in items:
+        module = item.path.stem
+        traits = {*getattr(item, "fixturenames", ()), module, getattr(item, "originalname", None)}
+        for marker, wanted in MARKERS.items():
+            if traits & wanted:
+                item.add_marker(marker)
+        if "torch" in packages_of(module):
+            item.add_marker("training")
+        if config.pluginmanager.hasplugin("xdist"):
+            alone = any(item.get_closest_marker(marker) for marker in ("dds", "install"))
+            item.add_marker(pytest.mark.xdist_group("nodes" if alone else module))
+
+
+def _missing(error: BaseException | None) -> bool:
+    """Tell if an error is due to an optional package that is not installed."""
+    while error is not None:
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in MISSING:
+            return True
+        error = error.__cause__
+    return False
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Iterator[None]:
+    """Skip a test that finds an optional package missing only when it runs."""
+    outcome = yield
+    if MISSING and call.excinfo and _missing(call.excinfo.value):
+        report = outcome.get_result()
+        report.outcome, report.longrepr = "skipped", (str(item.path), 0, f"Skipped: {call.excinfo.value}")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say which test modules were not collected, and why."""
+    if collect_ignore:
+        text = f"{', '.join(sorted(MISSING))} not installed; not collected: {' '.join(collect_ignore)}"
+        terminalreporter.write_line(text)
+
+
+# --- messages
 
 
 class RosMake:
-    """Factory of rclpy's message classes."""
+    """Message factory of rclpy's classes."""
 
     def __call__(self, type_name: str, **fields):
         package, _, name = type_name.split("/")
@@ -43,9 +139,11 @@ class RosMake:
 
 
 class BagMake:
-    """Factory of rosbags' dataclasses, with the foreign packages registered."""
+    """Message factory of rosbags' dataclasses, with the foreign packages registered."""
 
     def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
         self.store = get_typestore(Stores.ROS2_JAZZY)
         for name, text in DEFINITIONS.items():
             self.store.register(get_types_from_msg(text, name))
@@ -59,11 +157,11 @@ class BagMake:
 
     @staticmethod
     def floats(values):
-        """A float32[] field."""
+        """Return the value of a float32[] field."""
         return np.array(values, np.float32)
 
     def through_cdr(self, msg):
-        """The message as a bag gives it back; that also checks that every field is fit to be written."""
+        """Return the message as a bag delivers it; this also checks that every field can be written."""
         name = msg.__msgtype__
         return self.store.deserialize_cdr(self.store.serialize_cdr(msg, name), name)
 
@@ -74,9 +172,15 @@ def bag_make() -> BagMake:
 
 
 @pytest.fixture(scope="session", params=["rclpy", "rosbags"])
-def make(request, bag_make):
-    """Every test that asks for it runs with rclpy's classes and with rosbags'."""
-    return RosMake() if request.param == "rclpy" else bag_make
+def every_make(request):
+    """Both message factories: every test with this fixture runs twice."""
+    return RosMake() if request.param == "rclpy" else request.getfixturevalue("bag_make")
+
+
+@pytest.fixture
+def make(every_make):
+    """Both message factories, unless a test module overrides this fixture with one."""
+    return every_make
 
 
 def header_of(make, seconds: int = 7, nanoseconds: int = 5, frame: str = "camera_color_optical_frame"):
@@ -84,7 +188,7 @@ def header_of(make, seconds: int = 7, nanoseconds: int = 5, frame: str = "camera
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
-#: A standing person in metres, x right, y down, z forward, who looks at the camera: the COCO points in order.
+#: The COCO points of a standing person that faces the camera; metres, x right, y down, z forward.
 PERSON = np.array(
     [
         (0, -0.62, -0.12),
@@ -111,10 +215,9 @@ FOCAL, CENTRE = 600.0, (320.0, 240.0)
 
 @pytest.fixture(scope="session")
 def model_file(tmp_path_factory) -> Path:
-    """A model file whose every shape is PERSON: its only weights that are not zero are the last bias."""
+    """A model file that gives PERSON for every input: all weights are zero except the last bias."""
     from paul_ros.layout import load_layout
-    from paul_ros.model_file import save_model, weight_shapes
-    from paul_ros.normalisation import to_unit_size
+    from paul_ros.model import save_model, to_unit_size, weight_shapes
 
     layout = load_layout("coco17")
     shape = to_unit_size(PERSON.T[None], layout)[0]
@@ -139,11 +242,9 @@ def model_file(tmp_path_factory) -> Path:
 
 
 def coco_model():
-    """The shipped model as one of COCO-17 alone: its weights for the other points left out."""
+    """Return the shipped model reduced to COCO-17, without the weights of the other points."""
     from paul_ros.layout import load_layout
-    from paul_ros.model import Model
-    from paul_ros.model_file import load_model
-    from paul_ros.normalisation import to_unit_size
+    from paul_ros.model import Model, load_model, to_unit_size
 
     human, coco = load_model(), load_layout("coco17")
     own = np.array([human.layout.names.index(name) for name in coco.names])
@@ -160,12 +261,12 @@ def coco_model():
 
 
 def persons_at(*places) -> np.ndarray:
-    """(N, 17, 3) metres: PERSON at each (x, y, z)."""
+    """Return PERSON at each (x, y, z), as (N, 17, 3) metres."""
     return PERSON + np.array(places, dtype=float).reshape(-1, 1, 3)
 
 
 def seen(points: np.ndarray) -> np.ndarray:
-    """(N, P, 2) pixels of points (N, P, 3) under the tests' camera."""
+    """Return the pixels (N, P, 2) of points (N, P, 3) in the tests' camera."""
     return FOCAL * points[..., :2] / points[..., 2:] + CENTRE
 
 
@@ -189,16 +290,16 @@ def camera_info(make, fx: float = FOCAL, fy: float = FOCAL, cx: float = CENTRE[0
 
 
 class LifterProcess:
-    """The real node as a process of its own, in a namespace of its own; its log is in `log()`."""
+    """The real node in its own process and namespace; `log()` returns its output."""
 
     def __init__(self, folder: Path, namespace: str, *ros_args: str) -> None:
         self.namespace = namespace
         self._log = folder / f"{namespace}.log"
-        # The wheels' start-up hook marks its work here, and a child that inherits the mark skips it.
+        # The start-up hook of the ROS wheels sets this mark, and a child that inherits it would skip the hook.
         env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
         with open(self._log, "wb") as log:
             self.process = subprocess.Popen(
-                [*LIFTER, "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
+                [sys.executable, "-m", "paul_ros.ros.node", "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
                 cwd=ROOT,
                 env=env,
                 stdout=log,
@@ -209,14 +310,14 @@ class LifterProcess:
         return self._log.read_text()
 
     def stop(self, number: int = signal.SIGTERM) -> int:
-        """Ends it by a signal; its exit code."""
+        """Send a signal and return the exit code."""
         self.process.send_signal(number)
         return self.process.wait(20)
 
 
 @pytest.fixture(scope="session")
 def ros():
-    """rclpy, started in the test's own process."""
+    """rclpy, initialised in the tests' process."""
     import rclpy
 
     rclpy.init()
@@ -226,7 +327,7 @@ def ros():
 
 @pytest.fixture(scope="module")
 def start_lifter(tmp_path_factory):
-    """start_lifter(*ros_args) -> LifterProcess; all are ended with the module."""
+    """start_lifter(*ros_args) -> LifterProcess; all stop with the module."""
     folder, started = tmp_path_factory.mktemp("nodes"), []
 
     def start(*ros_args: str) -> LifterProcess:
@@ -235,6 +336,6 @@ def start_lifter(tmp_path_factory):
 
     yield start
     for lifter in started:
-        # Not by SIGKILL: that would leave the middleware's shared memory behind.
+        # SIGKILL would leave the middleware's shared memory behind.
         if lifter.process.poll() is None:
             lifter.stop()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of packages that are on no index: their fields as far as keypoints go, and how each family says a pose.
+"""Messages of packages that are not on PyPI: definitions reduced to the used fields, and builders for poses.
 
-A pose is {keypoint name: (x, y)} in pixels, names as layouts spell them. Every builder takes a factory `make`, so the
-same message is built of what rclpy gives (LiveMake) and of what a bag gives (conftest.BagMake).
+A pose is {keypoint name: (x, y)} in pixels, with the names of layouts. Every builder takes a message factory `make`:
+LiveMake for messages as rclpy delivers them, conftest.BagMake for messages as a bag delivers them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ HRI, ZED, AI = ("hri_msgs/msg/Skeleton2D", "zed_msgs/msg/ObjectsStamped", "ai_ms
 OPENDR = "opendr_interface/msg/OpenDRPose2D"
 OPENPOSE_LIST, OPENPOSE_FRAME = "openpose_ros2_msgs/msg/PoseKeyPointsList", "ros_openpose/msg/Frame"
 
-#: Type name -> text of its .msg file, what is used before what uses it.
+#: Type name -> text of its .msg file, in the order of dependence.
 DEFINITIONS = {
     "yolo_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
     "yolo_msgs/msg/KeyPoint2D": "int32 id\nyolo_msgs/Point2D point\nfloat64 score\n",
@@ -47,7 +47,7 @@ DEFINITIONS = {
     "ros_openpose/msg/Person": "ros_openpose/BodyPart[] bodyParts\nros_openpose/BodyPart[] leftHandParts\n"
     "ros_openpose/BodyPart[] rightHandParts\n",
     OPENPOSE_FRAME: "std_msgs/Header header\nros_openpose/Person[] persons\n",
-    # What the node publishes where these are installed.
+    # Published by the node if these packages are installed.
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "foxglove_msgs/msg/Color": "float64 r\nfloat64 g\nfloat64 b\nfloat64 a\n",
     "foxglove_msgs/msg/Point2": "float64 x\nfloat64 y\n",
@@ -60,7 +60,7 @@ DEFINITIONS = {
 
 SIZE = (640, 480)
 
-# The orders, written out a second time on purpose: by the constants and enumerations of the packages' own documents.
+# The orders of points, repeated on purpose: from the constants and enumerations in the packages' documentation.
 _RIGHT_FIRST = "nose neck RSHO RELB RWRI LSHO LELB LWRI {} RHIP RKNE RANK LHIP LKNE LANK REYE LEYE REAR LEAR"
 _WORDS = {
     "SHO": "shoulder",
@@ -78,7 +78,7 @@ _WORDS = {
 
 
 def _names(text: str) -> list[str]:
-    """LSHO = left_shoulder; - = a point that the layouts do not have."""
+    """Return names for abbreviations: LSHO = left_shoulder, - = a point that no layout has."""
 
     def name(word: str) -> str:
         if word[1:] in _WORDS:
@@ -106,24 +106,24 @@ OPENDR_NAMES = (
 
 
 class LiveMake:
-    """Attributes as rclpy's messages have them; the packages themselves are not here."""
+    """Message factory with the attributes of rclpy's messages; the packages are not installed."""
 
     def __call__(self, type_name: str, **fields) -> SimpleNamespace:
         return SimpleNamespace(**fields)
 
     @staticmethod
     def floats(values) -> array.array:
-        """A float32[] field."""
+        """Return the value of a float32[] field."""
         return array.array("f", values)
 
     @staticmethod
     def through_cdr(msg):
-        """It is live: nothing happens to it."""
+        """Return the message as it is."""
         return msg
 
 
 def hri(make, header, pose: dict, confidence: float = 0.9):
-    """One body; points that the pose lacks are as a fresh message has them."""
+    """Make one body; points that the pose lacks keep the defaults."""
     points = [(pose[n][0] / SIZE[0], pose[n][1] / SIZE[1], confidence) if n in pose else (0.0,) * 3 for n in HRI18]
     return make(HRI, header=header, skeleton=[hri_point(make, *map(float, point)) for point in points])
 
@@ -159,7 +159,7 @@ def ai(make, header, targets: list):
 
 
 def ai_target(make, ident: int, **points):
-    """points: type -> (rows of x, y; confidences)."""
+    """Make a target; points: type -> (rows of x, y; confidences)."""
     groups = [
         make(
             "ai_msgs/msg/Point",
@@ -173,13 +173,13 @@ def ai_target(make, ident: int, **points):
 
 
 def opendr(make, header, pose: dict, ident: int = 1, conf: float = 17.5):
-    """One person; points that the pose lacks are left out."""
+    """Make one person without the points that the pose lacks."""
     named = zip(OPENDR_NAMES.split(), OPENPOSE18)
     return opendr_of(make, header, [(short, *pose[name]) for short, name in named if name in pose], ident, conf)
 
 
 def opendr_of(make, header, rows: list, ident: int = 1, conf: float = 17.5):
-    """rows: (kpt_name, x, y)."""
+    """Make one person of rows (kpt_name, x, y)."""
     keypoints = [
         make("opendr_interface/msg/OpenDRPose2DKeypoint", kpt_name=name, x=round(x), y=round(y)) for name, x, y in rows
     ]
@@ -187,7 +187,7 @@ def opendr_of(make, header, rows: list, ident: int = 1, conf: float = 17.5):
 
 
 def openpose_list(make, header, persons: list):
-    """persons: rows of x, y, score, as openpose_rows() makes them."""
+    """Make a list of persons, each with rows (x, y, score) from openpose_rows()."""
     lists = [
         make(
             "openpose_ros2_msgs/msg/PoseKeyPoints",
@@ -199,7 +199,7 @@ def openpose_list(make, header, persons: list):
 
 
 def openpose_frame(make, header, persons: list):
-    """As openpose_list, with hands that nobody should take for a body."""
+    """Make a frame of persons like openpose_list, with hands, which must be ignored."""
 
     def part(x, y, score):
         nowhere = make("geometry_msgs/msg/Point32", x=0.0, y=0.0, z=0.0)

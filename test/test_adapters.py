@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The adapters: what is written is read again, and every trap of the message families is caught."""
+"""The shipped adapters and the writers: round trips, missing values, and messages to refuse."""
 
 from __future__ import annotations
 
@@ -8,16 +8,24 @@ import array
 import numpy as np
 import pytest
 from conftest import camera_info, header_of
+from foreign_messages import LiveMake
 
 from msg_adapters import MessageError, WrongPointCount, outputs, read, read_camera_info
+from msg_adapters.palette import SIDE_COLOURS, rgb
 
 CLOUD, POSES, YOLO = ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "yolo_msgs/msg/DetectionArray")
 P = 5
 FORMATS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 
+@pytest.fixture
+def make(bag_make):
+    """One family: the details are the same for both, and `every_make` gives both."""
+    return bag_make
+
+
 def some_points(persons: int = 2) -> np.ndarray:
-    """(N, P, 2) whole pixels, so that integer fields can carry them too; none is (0, 0)."""
+    """Return (N, P, 2) whole pixels, which integer fields can hold too; none is (0, 0)."""
     return np.arange(1, persons * P * 2 + 1, dtype=float).reshape(persons, P, 2)
 
 
@@ -31,7 +39,7 @@ def cloud_of(
     offset: int = 0,
     **changes,
 ):
-    """A PointCloud2 of columns, each (height, width), with chosen types, byte order, padding and offsets."""
+    """Return a PointCloud2 of columns, each (height, width), with these types, byte order, padding and offsets."""
     formats = formats or {}
     height, width = next(iter(columns.values())).shape
     forms = [formats.get(name, "f4") for name in columns]
@@ -105,13 +113,13 @@ def reason_of(type_name: str, msg) -> str:
     return error.value.reason
 
 
-# --- PointCloud2: what must be read
+# --- PointCloud2: valid messages
 
 
-def test_cloud_round_trip(make):
+def test_cloud_round_trip(every_make):
     xy, confidence = some_points(), np.linspace(0.1, 1, 2 * P).reshape(2, P)
     xy[1, 2] = np.nan
-    got = read(CLOUD, outputs.keypoints_cloud(make, header_of(make), xy, confidence, ("12", "")), P)
+    got = read(CLOUD, outputs.keypoints_cloud(every_make, header_of(every_make), xy, confidence, ("12", "")), P)
     np.testing.assert_array_equal(got.xy, xy)
     np.testing.assert_array_equal(got.visible, ~np.isnan(xy[..., 0]))
     np.testing.assert_allclose(got.confidence, np.where(got.visible, confidence, 0), atol=1e-7)
@@ -145,8 +153,8 @@ def test_cloud_with_padding_mixed_types_and_another_field_order(make):
     assert got.ids == ("3", "")
 
 
-def test_flat_cloud_is_split_into_persons(make):
-    msg = cloud_of(make, xy_columns(some_points(3).reshape(1, -1, 2)), row_step=0)
+def test_flat_cloud_is_split_into_persons(every_make):
+    msg = cloud_of(every_make, xy_columns(some_points(3).reshape(1, -1, 2)), row_step=0)
     np.testing.assert_array_equal(read(CLOUD, msg, P).xy, some_points(3))
 
 
@@ -179,16 +187,16 @@ def test_cloud_confidence_nan_is_missing_and_others_are_clipped(make):
     np.testing.assert_array_equal(got.confidence, [[0, 1, 0, 0.25, 0]])
 
 
-def test_reading_a_cloud_changes_nothing_in_it(make):
+def test_reading_a_cloud_changes_nothing_in_it(every_make):
     xy = some_points()
     xy[0, 0] = np.inf
-    msg = cloud_of(make, xy_columns(xy), {"x": "f8", "y": "f8"})
+    msg = cloud_of(every_make, xy_columns(xy), {"x": "f8", "y": "f8"})
     before = bytes(msg.data)
     read(CLOUD, msg, P)
     assert bytes(msg.data) == before
 
 
-# --- PointCloud2: what must be refused
+# --- PointCloud2: messages to refuse
 
 
 def test_cloud_with_other_field_names(make):
@@ -230,9 +238,9 @@ def test_cloud_whose_steps_contradict_its_fields(make, changes):
     assert reason_of(CLOUD, cloud_of(make, xy_columns(some_points()), **changes)) == "wrong_steps"
 
 
-def test_cloud_cut_short(make):
-    msg = cloud_of(make, xy_columns(some_points()))
-    msg.data = make.octets(bytes(msg.data)[:-1])
+def test_cloud_cut_short(every_make):
+    msg = cloud_of(every_make, xy_columns(some_points()))
+    msg.data = every_make.octets(bytes(msg.data)[:-1])
     assert reason_of(CLOUD, msg) == "truncated_data"
 
 
@@ -259,9 +267,9 @@ def test_cloud_with_another_number_of_points_says_which_would_fit(make, shape, f
 # --- PoseArray
 
 
-def test_pose_array_of_two_persons_with_confidence(make):
+def test_pose_array_of_two_persons_with_confidence(every_make):
     confidence = np.linspace(0, 0.9, 2 * P).reshape(2, P, 1)
-    got = read(POSES, poses_of(make, np.concatenate([some_points(), confidence], axis=-1)), P)
+    got = read(POSES, poses_of(every_make, np.concatenate([some_points(), confidence], axis=-1)), P)
     np.testing.assert_array_equal(got.xy, some_points())
     np.testing.assert_allclose(got.confidence, confidence[..., 0])
     assert got.visible.all() and got.ids == ("", "")
@@ -297,7 +305,7 @@ def test_pose_array_with_another_number_of_points(make):
     assert reason_of(POSES, poses_of(make, np.zeros((P + 1, 3)))) == "wrong_point_count"
 
 
-# --- yolo_msgs, which only rosbags' typestore knows here
+# --- yolo_msgs, which has no rclpy package here
 
 
 def test_yolo_places_points_by_their_one_based_id(bag_make):
@@ -337,22 +345,22 @@ def test_unknown_type(make):
 # --- CameraInfo
 
 
-def test_camera_info(make):
-    got = read_camera_info(camera_info(make, fy=610.0))
+def test_camera_info(every_make):
+    got = read_camera_info(camera_info(every_make, fy=610.0))
     assert (got.fx, got.fy, got.cx, got.cy, got.width, got.height) == (600, 610, 320, 240, 640, 480)
 
 
 @pytest.mark.parametrize(
     "wrong", [{"fx": 0.0, "fy": 0.0}, {"fx": np.nan}, {"fy": -600.0}, {"fy": np.inf}, {"cx": np.nan}]
 )
-def test_camera_info_that_is_no_camera(make, wrong):
+def test_camera_info_that_is_no_camera(every_make, wrong):
     with pytest.raises(MessageError) as error:
-        read_camera_info(camera_info(make, **wrong))
+        read_camera_info(camera_info(every_make, **wrong))
     assert error.value.reason == "bad_intrinsics"
 
 
 def info_with(make, p=(600, 600, 320, 240), k=(600, 600, 320, 240), d=(0.0,) * 5, size=(640, 480)):
-    """CameraInfo with fx, fy, cx, cy of P and of K."""
+    """Return a CameraInfo with fx, fy, cx, cy of P and of K."""
     msg = camera_info(make)
     msg.p = np.array([p[0], 0, p[2], 0, 0, p[1], p[3], 0, 0, 0, 1.0, 0])
     msg.k = np.array([k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1.0])
@@ -402,30 +410,30 @@ def test_camera_info_of_wide_and_long_lenses(make, focal, size):
 
 
 def written(make, bag_make, msg):
-    """As a bag gives it back, where the message is rosbags'; rclpy's has had its fields checked already."""
+    """Return a message of rosbags as a bag delivers it; rclpy has checked the fields of its own already."""
     return bag_make.through_cdr(msg) if make is bag_make else msg
 
 
-def test_pose_array_writer(make, bag_make):
+def test_pose_array_writer(every_make, bag_make):
     points = np.random.default_rng(1).normal(size=(2, P, 3)).astype(np.float32)
-    header = header_of(make)
-    msg = outputs.pose_array(make, header, points)
+    header = header_of(every_make)
+    msg = outputs.pose_array(every_make, header, points)
     assert msg.header is header
-    msg = written(make, bag_make, msg)
+    msg = written(every_make, bag_make, msg)
     got = [(p.position.x, p.position.y, p.position.z) for p in msg.poses]
     np.testing.assert_array_equal(got, points.reshape(-1, 3))
     assert {(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in msg.poses} == {(0, 0, 0, 1)}
 
 
-def test_points_cloud_writer(make, bag_make):
+def test_points_cloud_writer(every_make, bag_make):
     points = np.random.default_rng(2).normal(size=(3, P, 3)).astype(np.float32)
     confidence = np.full((3, P), 0.5)
     msg = written(
-        make,
+        every_make,
         bag_make,
         outputs.points_cloud(
-            make,
-            header_of(make),
+            every_make,
+            header_of(every_make),
             points,
             confidence,
             ("7", "anna", "99999999999"),
@@ -465,15 +473,13 @@ def test_person_ids_as_numbers(text, number):
     assert outputs.id_numbers([""] * 5 + [text])[5] == number
 
 
-def test_markers_are_two_packed_lists_with_sides_and_hidden_points(make, bag_make):
+def test_markers_are_two_packed_lists_with_sides_and_hidden_points(every_make, bag_make):
     points = np.random.default_rng(3).normal(size=(2, 4, 3))
     observed = np.array([[True, True, True, True], [True, False, True, True]])
     sides = ("right", "left", "left", "right")
-    msg = written(
-        make,
-        bag_make,
-        outputs.skeleton_markers(make, header_of(make), points, observed, [(1, 2), (0, 3), (2, 3)], sides, 0.02),
-    )
+    edges, header = [(1, 2), (0, 3), (2, 3)], header_of(every_make)
+    msg = outputs.skeleton_markers(every_make, header, points, observed, edges, sides, 0.02)
+    msg = written(every_make, bag_make, msg)
     bones, spheres = msg.markers
     assert (bones.type, spheres.type) == (bones.LINE_LIST, bones.SPHERE_LIST)
     assert (bones.ns, bones.id) != (spheres.ns, spheres.id)
@@ -483,21 +489,45 @@ def test_markers_are_two_packed_lists_with_sides_and_hidden_points(make, bag_mak
     np.testing.assert_array_equal([(p.x, p.y, p.z) for p in spheres.points], points.reshape(-1, 3))
     assert [c.a < 1 for c in spheres.colors] == [False] * 5 + [True] + [False] * 2
     assert [c.a < 1 for c in bones.colors] == [False] * 6 + [True] * 2 + [False] * 4
-    for left, right in ((spheres.colors[1], spheres.colors[0]), (bones.colors[1], bones.colors[3])):
-        assert left.r > max(left.g, left.b) and right.g > max(right.r, right.b)
-    across = bones.colors[4:6]  # from the left to the right: the colour of neither
-    assert all(colour.b > max(colour.r, colour.g) for colour in across)
+    for side, colours in {
+        "left": (spheres.colors[1], bones.colors[0], bones.colors[1]),
+        "right": (spheres.colors[0], bones.colors[2], bones.colors[3]),
+        "": bones.colors[4:6],  # from the left to the right: the colour of neither
+    }.items():
+        assert [(c.r, c.g, c.b) for c in colours] == [pytest.approx(rgb(SIDE_COLOURS[side]))] * len(colours)
     assert bones.pose.orientation.w == 1 and 0 < bones.scale.x < spheres.scale.x
 
 
-def test_nobody_is_written_as_empty_messages(make, bag_make):
-    nobody, nothing = np.empty((0, P, 3)), np.empty((0, P))
-    assert len(written(make, bag_make, outputs.pose_array(make, header_of(make), nobody)).poses) == 0
-    cloud = written(
-        make, bag_make, outputs.points_cloud(make, header_of(make), nobody, nothing, (), np.empty(0), np.empty(0))
-    )
+def test_left_is_blue_and_right_is_orange():
+    """These survive colour blindness; red and green do not."""
+    (_, _, blue), (red, green, _) = rgb(SIDE_COLOURS["left"]), rgb(SIDE_COLOURS["right"])
+    assert blue > 0.75 and red > 0.75 and 0.25 < green < 0.65
+
+
+def test_annotations_count_from_the_corner_of_the_first_pixel():
+    """CameraInfo counts from its middle, half a pixel further."""
+    pixels = np.array([[[0.0, 0.0], [10.0, 20.5], [np.nan, np.nan], [3.0, 4.0]]])
+    observed = np.array([[True, True, True, False]])
+    sides, edges = ("left", "right", "", "left"), [(0, 3), (0, 1), (1, 2)]
+    make = LiveMake()
+    lines, dots = outputs.image_annotations(make, header_of(make), pixels, observed, edges, sides).points
+    assert [(p.x, p.y) for p in dots.points] == [(0.5, 0.5), (10.5, 21.0), (3.5, 4.5)]
+    assert [(p.x, p.y) for p in lines.points] == [(0.5, 0.5), (3.5, 4.5), (0.5, 0.5), (10.5, 21.0)]
+    assert [(c.r, c.a) for c in dots.outline_colors] == [
+        (rgb(SIDE_COLOURS[side])[0], alpha) for side, alpha in (("left", 1.0), ("right", 1.0), ("left", 0.3))
+    ]
+    assert [(c.r, c.a) for c in lines.outline_colors] == [
+        (rgb(SIDE_COLOURS[side])[0], alpha) for side, alpha in (("left", 0.3), ("", 1.0))
+    ]
+
+
+def test_nobody_is_written_as_empty_messages(every_make, bag_make):
+    nobody, nothing, header = np.empty((0, P, 3)), np.empty((0, P)), header_of(every_make)
+    poses = written(every_make, bag_make, outputs.pose_array(every_make, header, nobody))
+    assert len(poses.poses) == 0
+    cloud = outputs.points_cloud(every_make, header, nobody, nothing, (), np.empty(0), np.empty(0))
+    cloud = written(every_make, bag_make, cloud)
     assert (cloud.height, cloud.width, len(cloud.data)) == (0, P, 0)
-    markers = written(
-        make, bag_make, outputs.skeleton_markers(make, header_of(make), nobody, nothing > 0, [(0, 1)], ("",) * P, 0.02)
-    ).markers
+    markers = outputs.skeleton_markers(every_make, header, nobody, nothing > 0, [(0, 1)], ("",) * P, 0.02)
+    markers = written(every_make, bag_make, markers).markers
     assert all(marker.action == marker.DELETE and len(marker.points) == 0 for marker in markers)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serialised bytes: read and written here, and by rclpy's own (de)serialiser; damage is told, never a crash."""
+"""Serialised bytes are read and written as rclpy does it; damaged bytes raise MessageError."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_field_may_change_while_the_length_stays():
 
 
 def test_a_cloud_that_rclpy_padded():
-    """DDS rounds a payload up to four bytes."""
+    """DDS pads a payload to a multiple of four bytes."""
     msg = keypoints()
     same_cloud(CloudReader()(serialised(msg) + b"\xaa\xaa\xaa"), msg)
 
@@ -147,8 +147,8 @@ def test_stamps_out_of_range_are_refused():
 # --- damage
 
 
-def told(read: CloudReader, data: bytes) -> None:
-    """Either a cloud whose adapter reads it or says why not, or MessageError; nothing else."""
+def only_message_errors(read: CloudReader, data: bytes) -> None:
+    """Read bytes and the cloud; only a MessageError may come."""
     try:
         msg_adapters.read(CLOUD, read(data), 17)
     except MessageError as error:
@@ -183,8 +183,8 @@ def test_other_encodings_are_refused(encoding):
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=300))
 def test_any_bytes(data):
-    told(CloudReader(), data)
-    told(CloudReader(), b"\0\1\0\0" + data)
+    only_message_errors(CloudReader(), data)
+    only_message_errors(CloudReader(), b"\0\1\0\0" + data)
 
 
 @settings(max_examples=300, deadline=None)
@@ -194,6 +194,6 @@ def test_damaged_bytes(changes, cut):
     for place, value in changes:
         data[place] = value
     read = CloudReader()
-    told(read, bytes(data[: len(data) - cut]))
-    told(read, bytes(data))
+    only_message_errors(read, bytes(data[: len(data) - cut]))
+    only_message_errors(read, bytes(data))
     same_cloud(read(serialised(keypoints())), keypoints())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Foreign message packages for real: generated, compiled and imported, and the node run on them over DDS."""
+"""Foreign message packages are generated, compiled and imported; the node reads their messages over DDS."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ PERSON = seen(persons_at((0.3, 0, 4)))[0]
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """compiled(package) -> the folder that it is in, importable until the module ends.
+    """compiled(package) -> its folder; the package can be imported until the module ends.
 
-    Other tests want these packages missing, so nothing of them stays in this process.
+    Other tests need these packages to be missing, so they are removed from this process.
     """
     folder, done = tmp_path_factory.mktemp("compiled"), []
     patch = pytest.MonkeyPatch()
@@ -50,7 +50,7 @@ def compiled(tmp_path_factory):
 
 
 def detections(header):
-    """yolo_ros as it is: ids from 1, a sparse list, in an order of its own."""
+    """Return a message as yolo_ros sends it: ids from 1, a sparse list, in another order."""
     keypoints = [
         MAKE(
             "yolo_msgs/msg/KeyPoint2D",
@@ -67,7 +67,7 @@ def detections(header):
 
 
 def skeleton(header):
-    """A ROS4HRI body in shares of the image."""
+    """Return a ROS4HRI body in normalised coordinates."""
     pose = dict(zip(COCO, PERSON))
     pose["neck"] = (np.add(pose["left_shoulder"], pose["right_shoulder"])) / 2
     assert set(hri_adapter.NAMES) <= set(pose) and SIZE == (640, 480)
@@ -75,7 +75,7 @@ def skeleton(header):
 
 
 def calibrated(bench):
-    """Sends CameraInfo until the node has it: what is sent before both ends know each other reaches nobody."""
+    """Return a condition that sends CameraInfo until the node has it: messages before discovery are lost."""
 
     def once():
         bench.camera.publish(camera_info(MAKE))
@@ -102,7 +102,7 @@ def test_the_node_lifts_yolo_ros(ros, start_lifter, model_file, compiled):
 
 
 def test_the_node_lifts_a_body_of_ros4hri(ros, start_lifter, model_file, compiled):
-    """One person a message: it is lifted although no other stamp follows."""
+    """A message holds one person, who is lifted although no other stamp follows."""
     compiled("hri_msgs")
     lifter = start_lifter("-p", f"model:={model_file}")
     bench = Bench(ros, lifter, HRI)
@@ -122,7 +122,7 @@ def test_the_node_lifts_a_body_of_ros4hri(ros, start_lifter, model_file, compile
 
 
 def bench_hears(bench, fill):
-    """Sends until an answer shows that both directions are up."""
+    """Return a condition that sends until an answer shows that both directions work."""
 
     def heard():
         bench.send(fill)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The families of foreign packages: each trap of theirs, read from live messages and from a bag's alike."""
+"""The adapters of foreign packages: points by name, missing values, ids, and messages to refuse."""
 
 from __future__ import annotations
 
@@ -13,13 +13,19 @@ from paul_ros.layout import layout_names, load_layout
 
 COCO = load_layout("coco17").names
 ALL_NAMES = tuple(dict.fromkeys(name for layout in layout_names() for name in load_layout(layout).names))
-#: A pixel of its own for every point that any layout has, x and y told apart.
+#: A different pixel for every point of any layout; x and y differ too.
 POSE = {name: (10.0 + 3 * index, 400.0 - 2 * index) for index, name in enumerate(ALL_NAMES)}
 
 
 @pytest.fixture(params=["live", "bag"])
-def make(request, bag_make):
+def every_make(request, bag_make):
     return foreign.LiveMake() if request.param == "live" else bag_make
+
+
+@pytest.fixture
+def make(bag_make):
+    """One family: the details are the same for both, and `every_make` gives both."""
+    return bag_make
 
 
 def source(names=COCO, **changes) -> Source:
@@ -39,7 +45,7 @@ def reason_of(make, type_name: str, msg, names=COCO, **changes) -> str:
 
 
 def expected(names, own) -> np.ndarray:
-    """(P, 2): the pixel of each point that the family has, NaN for the others."""
+    """Return (P, 2): the pixel of each point that the family has, NaN for the others."""
     return np.array([POSE[name] if name in own else (np.nan, np.nan) for name in names])
 
 
@@ -51,17 +57,18 @@ def assert_pose(got, names, own, persons: int = 1) -> None:
     assert (got.stamp, got.frame_id) == (7_000_000_005, "camera_color_optical_frame")
 
 
-LAYOUTS = ("coco17", "openpose18", "hri18", "body25", "h36m17")
+#: One with fewer points than most families, one with more, in another order.
+LAYOUTS = ("coco17", "body25")
 
 
 # --- ROS4HRI
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_hri_points_are_placed_by_name(make, layout):
-    """In its order the left eye comes first, in OpenPose's the right one; by position they would be swapped."""
+@pytest.mark.parametrize("layout", ["coco17", "openpose18", "hri18", "body25", "h36m17"])
+def test_hri_points_are_placed_by_name(every_make, layout):
+    """The left eye comes first here, the right eye in OpenPose: placed by position they would be swapped."""
     names = load_layout(layout).names
-    got = read_of(make, foreign.HRI, foreign.hri(make, header_of(make), POSE), names)
+    got = read_of(every_make, foreign.HRI, foreign.hri(every_make, header_of(every_make), POSE), names)
     assert_pose(got, names, foreign.HRI18)
     np.testing.assert_allclose(got.confidence[got.visible], 0.9, rtol=1e-6)
 
@@ -101,7 +108,7 @@ def test_hri_odd_points(make, point, visible):
 
 @pytest.mark.parametrize("x, y", [(320.0, 0.5), (0.5, 240.0), (-1.5, 0.5), (np.inf, 0.5)])
 def test_hri_pixels_where_shares_should_be_are_refused(make, x, y):
-    """As long as half of the points are shares, the others are a detector's wild guesses and count as missing."""
+    """If at least half of the points are normalised, the others are wild guesses of a detector and missing."""
     msg = foreign.hri(make, header_of(make), POSE)
     msg.skeleton[:9] = [foreign.hri_point(make, x, y, 0.9)] * 9
     assert_pose(read_of(make, foreign.HRI, msg), COCO, foreign.HRI18[9:])
@@ -130,13 +137,13 @@ def test_hri_id_is_in_the_topic(make, topic, ident):
 
 @pytest.mark.parametrize("body_format, own", foreign.ZED_ORDERS.items())
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_zed_takes_the_slots_of_its_format_by_name(make, body_format, own, layout):
+def test_zed_takes_the_slots_of_its_format_by_name(every_make, body_format, own, layout):
     names = load_layout(layout).names
-    msg = foreign.zed(make, header_of(make, frame="zed_left_camera_frame"), [POSE, POSE], body_format)
-    for body in msg.objects:  # what lies behind is zero in a real message, and none of our business
+    msg = foreign.zed(every_make, header_of(every_make, frame="zed_left_camera_frame"), [POSE, POSE], body_format)
+    for body in msg.objects:  # zero in a real message, and ignored
         for slot in body.skeleton_2d.keypoints[len(own) :]:
             slot.kp[:] = 99.0
-    got = read_of(make, foreign.ZED, msg, names)
+    got = read_of(every_make, foreign.ZED, msg, names)
     assert_pose(got, names, own, persons=2)
     np.testing.assert_array_equal(got.confidence, got.visible)
     assert got.ids == ("0", "1")
@@ -189,26 +196,26 @@ def body(names=COCO, confidence=0.7) -> tuple:
     return [POSE[name] for name in names], [confidence] * len(names)
 
 
-def test_ai_reads_body_keypoints_and_leaves_faces_and_hands(make):
+def test_ai_reads_body_keypoints_and_leaves_faces_and_hands(every_make):
     other = ([(1, 2)] * 5, [0.9] * 5)
     msg = foreign.ai(
-        make,
-        header_of(make),
+        every_make,
+        header_of(every_make),
         [
-            foreign.ai_target(make, 11, face_kps=other),
-            foreign.ai_target(make, 12, hand_kps=other, body_kps=body()),
-            foreign.ai_target(make, 13),
-            foreign.ai_target(make, 2**63, body_kps=body()),
+            foreign.ai_target(every_make, 11, face_kps=other),
+            foreign.ai_target(every_make, 12, hand_kps=other, body_kps=body()),
+            foreign.ai_target(every_make, 13),
+            foreign.ai_target(every_make, 2**63, body_kps=body()),
         ],
     )
-    got = read_of(make, foreign.AI, msg)
+    got = read_of(every_make, foreign.AI, msg)
     assert_pose(got, COCO, COCO, persons=2)
     np.testing.assert_allclose(got.confidence, 0.7, rtol=1e-6)
     assert got.ids == ("12", str(2**63))
 
 
 def test_ai_layout_is_the_detectors(make):
-    """The message does not name its points: they are those of the layout, in order."""
+    """The message does not name its points: they have the layout's order."""
     names = load_layout("body25").names
     msg = foreign.ai(make, header_of(make), [foreign.ai_target(make, 1, body_kps=body(names))])
     assert_pose(read_of(make, foreign.AI, msg, names), names, names)
@@ -217,15 +224,17 @@ def test_ai_layout_is_the_detectors(make):
     assert error.value.fits(25) and not error.value.fits(17)
 
 
-def test_ai_missing_points_and_confidences(make):
+def test_ai_missing_points_and_confidences(every_make):
     rows, confidence = body()
     rows[3] = (0.0, 0.0)
-    msg = foreign.ai(make, header_of(make), [foreign.ai_target(make, 1, body_kps=(rows, []))])
-    got = read_of(make, foreign.AI, msg)
+    msg = foreign.ai(every_make, header_of(every_make), [foreign.ai_target(every_make, 1, body_kps=(rows, []))])
+    got = read_of(every_make, foreign.AI, msg)
     assert_pose(got, COCO, set(COCO) - {COCO[3]})
     np.testing.assert_array_equal(got.confidence, got.visible)
-    msg = foreign.ai(make, header_of(make), [foreign.ai_target(make, 1, body_kps=(rows, confidence[:-1]))])
-    assert reason_of(make, foreign.AI, msg) == "wrong_confidence_count"
+    msg = foreign.ai(
+        every_make, header_of(every_make), [foreign.ai_target(every_make, 1, body_kps=(rows, confidence[:-1]))]
+    )
+    assert reason_of(every_make, foreign.AI, msg) == "wrong_confidence_count"
 
 
 def test_ai_ids_that_several_persons_share_are_none(make):
@@ -241,11 +250,11 @@ def test_ai_of_nobody(make):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_opendr_points_are_placed_by_name(make, layout):
+def test_opendr_points_are_placed_by_name(every_make, layout):
     names = load_layout(layout).names
-    msg = foreign.opendr(make, header_of(make), POSE)
+    msg = foreign.opendr(every_make, header_of(every_make), POSE)
     msg.keypoint_list.reverse()
-    got = read_of(make, foreign.OPENDR, msg, names)
+    got = read_of(every_make, foreign.OPENDR, msg, names)
     assert_pose(got, names, foreign.OPENPOSE18)
     np.testing.assert_array_equal(got.confidence, got.visible)
     assert got.ids == ("1",)
@@ -284,10 +293,10 @@ ORDERS = [foreign.OPENPOSE18, foreign.BODY25]
 @pytest.mark.parametrize("type_name", FORMS)
 @pytest.mark.parametrize("own", ORDERS, ids=len)
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_openpose_models_are_told_by_their_length(make, type_name, own, layout):
+def test_openpose_models_are_told_by_their_length(every_make, type_name, own, layout):
     names = load_layout(layout).names
-    msg = FORMS[type_name](make, header_of(make), [foreign.openpose_rows(POSE, own)] * 2)
-    got = read_of(make, type_name, msg, names)
+    msg = FORMS[type_name](every_make, header_of(every_make), [foreign.openpose_rows(POSE, own)] * 2)
+    got = read_of(every_make, type_name, msg, names)
     assert_pose(got, names, own, persons=2)
     np.testing.assert_allclose(got.confidence[got.visible], 0.8, rtol=1e-6)
     assert got.ids == ("", "")
@@ -350,8 +359,9 @@ def test_a_layout_of_another_thing_is_refused(make, type_name, names):
     assert reason_of(make, type_name, every_message(make)[type_name], names) == "no_common_names"
 
 
-def test_the_documentation_lists_every_type_that_can_be_read():
-    text = (ROOT / "docs/reference/messages.md").read_text(encoding="utf-8")
+def test_the_documents_name_every_supported_type():
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
     assert [name for name in SUPPORTED if f"`{name.replace('/msg/', '/')}`" not in text] == []
 
 

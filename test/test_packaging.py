@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One source tree serves pip, colcon and colcon --symlink-install: in each ROS finds what it starts."""
+"""One source tree serves pip, colcon and colcon --symlink-install; ROS finds the launchers in each of them."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ from pathlib import Path
 import pytest
 import yaml
 from catkin_pkg.package import parse_package
+from conftest import IN_VENV
 
 import paul_ros
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "paul_ros"
 ROOMS = ("paul_ros", "msg_adapters", "training")
-#: Where this run's own packages are (rclpy, NumPy ...); the installs under test borrow them.
+#: The packages of this run (rclpy, NumPy ...), which the installs under test use too.
 LIBRARIES = sysconfig.get_paths()["purelib"]
 
 
 @dataclass(frozen=True)
 class Install:
-    """An install prefix, and the environment of a shell that has sourced it."""
+    """An install prefix and the environment of a shell that has sourced it."""
 
     prefix: Path
     environment: dict[str, str]
 
     def launcher(self, name: str) -> Path:
-        """What `ros2 run paul_ros NAME` would start: get_executable_path of ros2pkg.api, step by step."""
+        """Return the file that `ros2 run paul_ros NAME` starts, by the steps of get_executable_path in ros2pkg.api."""
         code = f"from ament_index_python import get_package_prefix; print(get_package_prefix('{PACKAGE}'))"
         prefix = Path(self.run(sys.executable, "-c", code).strip())
         assert prefix == self.prefix
@@ -60,7 +61,7 @@ class Install:
 
 @pytest.fixture(scope="session")
 def source(tmp_path_factory) -> Path:
-    """A copy of what git has or would take, so that no build output of the working tree plays a part."""
+    """A copy of all files that git tracks or would add, without build outputs."""
     listed = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -77,7 +78,7 @@ def source(tmp_path_factory) -> Path:
 
 
 def pip_install(source: Path, folder: Path) -> Install:
-    """Into a virtual environment of its own, which sees the libraries of this one."""
+    """Install into a new virtual environment that sees the packages of this one."""
     prefix = folder / "venv"
     venv.create(prefix, symlinks=True, with_pip=True)
     tree = shutil.copytree(source, folder / "source")
@@ -92,7 +93,7 @@ def pip_install(source: Path, folder: Path) -> Install:
 
 
 def colcon_build(source: Path, folder: Path, *options: str) -> Install:
-    """In a workspace, then sourced as a user does."""
+    """Build in a workspace, then source it as a user does."""
     bin_first = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     build = subprocess.run(
         ["colcon", "--log-base", "log", "build", "--base-paths", source.parent, *options],
@@ -155,6 +156,7 @@ import importlib.resources, paul_ros, training, msg_adapters
 from paul_ros.layout import layout_names
 print(paul_ros.__file__, ' '.join(layout_names()), sep='\\n')
 print(*sorted(f.name for f in (importlib.resources.files('paul_ros') / 'models').iterdir()))
+assert all((importlib.resources.files(package) / 'py.typed').is_file() for package in ('paul_ros', 'msg_adapters'))
 """
     own_python = install.prefix / "bin" / "python3"
     answer = install.run(own_python if own_python.exists() else "python3", "-c", code)
@@ -171,6 +173,39 @@ print(*sorted(f.name for f in (importlib.resources.files('paul_ros') / 'models')
 
 def test_a_user_can_run_the_command_under_its_own_name(install: Install) -> None:
     assert "usage: paul" in install.run(install.prefix / "bin" / "paul", "--help")
+
+
+#: A pytest plugin in which the packages of $HIDDEN look as if they were not installed.
+HIDE = """
+import os
+from importlib.machinery import PathFinder
+
+find, hidden = PathFinder.find_spec, os.environ["HIDDEN"].split()
+PathFinder.find_spec = classmethod(
+    lambda _, name, *rest: None if name.partition(".")[0] in hidden else find(name, *rest)
+)
+"""
+
+
+@pytest.mark.install
+@pytest.mark.parametrize("hidden", ["torch", "torch rosbags mcap rich tqdm"])
+def test_the_nodes_tests_run_without(hidden: str, tmp_path: Path) -> None:
+    """`colcon test` on a robot without the packages for training, or without those for bags too."""
+    (tmp_path / "hide_packages.py").write_text(HIDE)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "HIDDEN": hidden}
+    environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+
+    def pytest_run(*arguments: str) -> str:
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "hide_packages", "-p", "no:cacheprovider", *arguments]
+        answer = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+        return answer.stdout
+
+    collected, said, left_out = pytest_run("--collect-only").partition("not installed; not collected: ")
+    assert said and "test_trainer.py" in left_out and "test_trainer.py" not in collected
+    for module in ("test_node.py", "test_node_lifecycle.py", "test_stream.py", "test_lifter.py"):
+        assert module in collected and module not in left_out
+    pytest_run("test/test_lost_messages.py", "test/test_node_lifecycle.py::test_transitions")
 
 
 def test_versions_agree() -> None:
@@ -193,12 +228,21 @@ def test_package_xml_is_valid_and_says_what_the_code_needs() -> None:
     imported = set(re.findall(r"^from (\w+)\.msg import", node, re.MULTILINE))
     made = set(re.findall(r'"(\w+)/msg/', writers))
     assert "rcl_interfaces" in imported and "builtin_interfaces" in made
-    # Who has no Foxglove has no use for its messages either.
+    # Foxglove's messages are useful only beside Foxglove, which brings them.
     assert (imported | made) - {"foxglove_msgs"} <= needed
 
 
+def test_package_xml_names_nothing_that_only_pip_has() -> None:
+    """Bloom refuses such keys for Debian packages, in test_depend too."""
+    package = parse_package(str(ROOT / "package.xml"))
+    names = {dependency.name for dependency in package.exec_depends + package.test_depends}
+    assert [name for name in names if name.endswith("-pip")] == []
+    assert not names & {"mcap-ros2-support", "python3-torch"}
+
+
+@pytest.mark.skipif(not IN_VENV, reason="`make test` sets up this environment")
 def test_the_environment_runs_this_source() -> None:
-    """A test that starts `paul` or the node would else judge an older state of the code."""
+    """Otherwise tests that start `paul` or the node would test older code."""
 
     def contents(folder: Path) -> dict[str, bytes]:
         files = (path for room in ROOMS for path in (folder / room).rglob("*"))
@@ -211,7 +255,7 @@ def test_the_environment_runs_this_source() -> None:
 
 
 def test_the_launch_file_names_what_there_is() -> None:
-    """launch and launch_ros are on no index: the file is read as XML, and its substitutions are checked."""
+    """launch and launch_ros are not on PyPI, so the test reads the file as XML and checks its substitutions."""
     launch = ElementTree.parse(ROOT / "launch/lifter.launch.xml").getroot()
     node = launch.find("node")
     assert node.get("pkg") == PACKAGE

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adapters of other packages: the documented example, really installed; broken ones cost only their messages."""
+"""Adapters of other packages: the documented example is installed and run; broken ones lose only their messages."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from node_bench import Bench
 import msg_adapters
 from msg_adapters import Adapter, Keypoints2D, MessageError, WrongPointCount, plugins, record
 from paul_ros.lifter import Lifter
-from paul_ros.model_file import load_model
+from paul_ros.model import load_model
 from paul_ros.offline.bag import BagMessages, BagWriter
 from paul_ros.stream.stream import LiftStream
 
 PEOPLE = "acme_msgs/msg/People"
 TRUE = persons_at((0.3, 0, 4), (-1, 0.1, 5))
-TEXT = (ROOT / "docs/how_to/write_an_adapter.md").read_text()
+#: The page with the example, wherever it stands.
+[TEXT] = [text for page in (ROOT / "docs").rglob("*.md") if "acme_keypoints/__init__.py" in (text := page.read_text())]
 
 
 def block(name: str) -> str:
-    """The code block below a file's name in the document."""
+    """Return the code block below a file's name in the document."""
     return re.search(rf"`{re.escape(name)}`\n\n```\w*\n(.*?)```", TEXT, re.DOTALL)[1]
 
 
@@ -49,7 +50,7 @@ def people(make, header, xy: np.ndarray):
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """A folder with the example, installed by pip, for PYTHONPATH."""
+    """A folder for PYTHONPATH in which pip has installed the example."""
     source, target = tmp_path_factory.mktemp("acme"), tmp_path_factory.mktemp("site")
     for name in ("pyproject.toml", "acme_keypoints/__init__.py"):
         (source / name).parent.mkdir(exist_ok=True)
@@ -137,7 +138,7 @@ build("acme_msgs", pathlib.Path(sys.argv[1]), json.loads(sys.argv[2]))
 
 
 def test_a_broken_plugin_does_not_stop_the_node(ros, start_lifter, model_file, tmp_path, monkeypatch):
-    """For a type that is installed, so that messages really come."""
+    """The type is an installed one, so that messages do arrive."""
     info = tmp_path / "broken_keypoints-2.1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-keypoints\nVersion: 2.1\n")
@@ -161,7 +162,7 @@ def test_a_broken_plugin_does_not_stop_the_node(ros, start_lifter, model_file, t
 
 
 class Point:
-    """An entry point as importlib.metadata gives it."""
+    """A stand-in for an entry point of importlib.metadata."""
 
     def __init__(self, target, name: str = PEOPLE, package: str = "acme"):
         self.name, self.value, self._target = name, "acme:X", target
@@ -173,7 +174,7 @@ class Point:
 
 @pytest.fixture
 def plug(monkeypatch):
-    """plug(*entry points): as if these were installed."""
+    """plug(*entry points) simulates their installation."""
     shipped = {name: msg_adapters.SUPPORTED[name] for name in msg_adapters.SUPPORTED}
 
     def install(*points):
@@ -218,12 +219,12 @@ BROKEN = {
     "a count that nobody can ask": (fails(Odd()), "wrong_point_count", "17 are not 5"),
     "gives nothing": (Adapter(lambda *_: None), "adapter_failed", "NoneType"),
     "too many points": (Adapter(lambda *_: sound(xy=np.zeros((2, 18, 2)))), "adapter_failed", "float64 (2, 18, 2)"),
-    "one id": (Adapter(lambda *_: sound(ids=("a",))), "adapter_failed", "of 1 ids"),
+    "one id": (Adapter(lambda *_: sound(ids=("a",))), "adapter_failed", "with 1 ids"),
     "whole numbers": (Adapter(lambda *_: sound(visible=np.ones((2, 17), int))), "adapter_failed", "visible is int64"),
     "NaN seen": (Adapter(lambda *_: sound(xy=np.full((2, 17, 2), np.nan))), "adapter_failed", "no pixels"),
     "ids that are none": (Adapter(lambda *_: sound(ids=(1, []))), "adapter_failed", "ids and frame_id text"),
     "a stamp that is none": (Adapter(lambda *_: sound(stamp=None)), "adapter_failed", "stamp must be an int"),
-    "a layout that is none": (Adapter(lambda *_: sound(), lambda _: []), "adapter_failed", "layout gave a list"),
+    "a layout that is none": (Adapter(lambda *_: sound(), lambda _: []), "adapter_failed", "layout returned a list"),
 }  # fmt: skip
 
 
@@ -234,20 +235,20 @@ def test_a_broken_adapter_costs_its_messages(plug, model_file, case):
     stream = LiftStream(Lifter(load_model(model_file)), None, 0.3, 64)
     assert PEOPLE in msg_adapters.SUPPORTED
     for _ in range(2):
-        assert stream.keypoints(PEOPLE, MESSAGE).frame is None
-    assert stream.ledger.drops == {reason: 2}
-    assert word in stream.ledger.advice[reason]
+        assert stream.keypoints(PEOPLE, MESSAGE) is None
+    assert stream.drops == {reason: 2}
+    assert word in stream.explanations[reason]
     if reason in ("broken_adapter", "adapter_failed"):
-        assert "the Python package acme 1.0" in stream.ledger.advice[reason]
-        assert "\n" not in stream.ledger.advice[reason]
+        assert "the Python package acme 1.0" in stream.explanations[reason]
+        assert "\n" not in stream.explanations[reason]
 
 
 def test_a_sound_one_is_lifted_and_asked_for_its_kind(plug, model_file):
     plug(Point(Adapter(lambda *_: sound(), lambda _: "coco17", one_person=True)))
     stream = LiftStream(Lifter(load_model(model_file)), None, 0.3, 64)
     assert PEOPLE in msg_adapters.ONE_PERSON
-    assert stream.keypoints(PEOPLE, MESSAGE).frame is None
-    assert stream.flush().lifted.ok.all() and not stream.ledger.drops
+    assert stream.keypoints(PEOPLE, MESSAGE) is None
+    assert stream.flush().lifted.ok.all() and not stream.drops
 
 
 def test_a_broken_one_is_of_no_kind(plug):
@@ -261,7 +262,7 @@ def test_shipped_types_cannot_be_taken_over(plug, caplog):
     plug(Point(fails(ValueError()), cloud, "thief"))
     assert list(msg_adapters.SUPPORTED).count(cloud) == 1 == len(caplog.messages)
     assert msg_adapters.SUPPORTED[cloud] is before
-    assert "the Python package thief 1.0" in caplog.text and "not used" in caplog.text
+    assert "the Python package thief 1.0" in caplog.text and "ignored" in caplog.text
 
 
 def test_two_for_one_type_are_none(plug):
