@@ -23,6 +23,7 @@ from paul_ros.model import check_size
 from paul_ros.offline.bag import check_outputs
 from paul_ros.stream.parameters import DEFAULTS
 from training.categories import load_files
+from training.checkpoint import CHECKPOINT, LOG
 from training.data import TrainingData, check_sizes
 from training.distributed import from_first, is_first, joined
 from training.encoder_fit import fit_encoder
@@ -31,12 +32,13 @@ from training.export import architecture, export_model
 from training.people.human_data import check_outside, make_file, motion_files, views_of
 from training.people.mocap import human_layout
 from training.people.view_settings import Views
+from training.progress import Progress
 from training.recipe import Recipe, recipe_names
 from training.reconstruction import Run, reconstruction_of, restarts, run_folder, train_restarts
-from training.start.kept_start import START, Progress
+from training.start.kept_start import START
 from training.tensorboard import FOLDER as BOARD
 from training.tensorboard import Board, need_tensorboard
-from training.trainer import CHECKPOINT, LOG, Trainer
+from training.trainer import Trainer
 
 VIEWS = "views.npz"
 """What the run's folder keeps of a folder of motion capture."""
@@ -282,8 +284,6 @@ def _watch(trainer: Trainer, args: argparse.Namespace) -> None:
     finally:
         if board:
             board.close()
-    if trainer.stopped and is_first():
-        print(f"seed {trainer.recipe.seed}: the loss has settled, stopped at step {trainer.step}", file=sys.stderr)
 
 
 def _prepare(trainer: Trainer, quiet: bool) -> None:

@@ -7,15 +7,16 @@ import math
 
 import torch
 
-from training.start.kept_start import Progress
-from training.trainer import Trainer, turned_views
+from training.progress import Progress, ignore_progress
+from training.trainer import Trainer
+from training.views import turned_views
 
 STEPS = 3000
 _BATCH = 128
 _LEARNING_RATE = 1e-3
 
 
-def fit_encoder(trainer: Trainer, steps: int = STEPS, progress: Progress = lambda done: None) -> float:
+def fit_encoder(trainer: Trainer, steps: int = STEPS, progress: Progress = ignore_progress) -> float:
     """Train h by regression to the run's free codes; returns the mean distance that is left, as a share of the size.
 
     Distances are of shapes, |f_d(h(W)) - f_d(phi)| over |f_d(phi)|, for codes have no scale of their own. Views are

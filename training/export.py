@@ -14,9 +14,13 @@ import paul_ros
 from paul_ros.layout import Layout
 from paul_ros.metrics import procrustes
 from paul_ros.model import save_model
+from training.chirality import rule_share, same_side_share
+from training.data import TrainingData
+from training.networks import Paul
 from training.objective import fit
 from training.recipe import Recipe
-from training.trainer import Trainer, predict_shapes, rule_share
+from training.trainer import Trainer
+from training.views import NormalisedViews
 
 _SHAPES, _COORDINATES = 4096, 2**24
 """Shapes of training frames that the mean is taken of: so many, or as many as have so many coordinates."""
@@ -136,15 +140,6 @@ def _chirality(shapes: np.ndarray, mean: np.ndarray, layout: Layout, weight: flo
     }
 
 
-def same_side_share(shapes: np.ndarray, mean: np.ndarray) -> float:
-    """Share of shapes (F,3,P) that turn onto the mean (3,P) better than their mirror images do.
-
-    With the singular values a >= b >= c of S mean^T, S fits by a + b +- c and its mirror image by a + b -+ c, with the
-    sign of the determinant.
-    """
-    return float((np.linalg.det(shapes @ mean.T) > 0).mean())
-
-
 def mean_shape(shapes: np.ndarray) -> np.ndarray:
     """Generalised Procrustes mean (3,P) of canonical shapes (F,3,P): rotations only, sizes as they are."""
     points = shapes.transpose(0, 2, 1)
@@ -153,6 +148,17 @@ def mean_shape(shapes: np.ndarray) -> np.ndarray:
         R, _ = procrustes(points, np.broadcast_to(mean, points.shape))
         mean = np.einsum("nij,npj->pi", R, points) / len(points)
     return mean.T
+
+
+@torch.no_grad()
+def predict_shapes(networks: Paul, data: TrainingData, limit: int) -> np.ndarray:
+    """Return canonical shapes (F,3,P) of up to ``limit`` evenly chosen training frames, from their 2D points by h."""
+    rows = np.linspace(0, len(data.W) - 1, min(limit, len(data.W))).astype(int)
+    device = next(networks.parameters()).device
+    W, visible = torch.from_numpy(data.W[rows]).to(device), torch.from_numpy(data.visible[rows]).to(device)
+    unit = None if networks.decoder.unit_size else data.image_unit
+    views = NormalisedViews.of(W, visible, torch.ones(len(rows), 1, 1, device=device), False, unit)
+    return networks.decoder(networks.encoder(views.W, visible)).double().cpu().numpy()
 
 
 @torch.no_grad()

@@ -37,6 +37,7 @@ from training.distributed import WHOLE, Share
 from training.networks import Paul, edge_lengths
 from training.recipe import Recipe
 from training.solver import Camera, algebraic_camera, centre, solve_camera
+from training.views import NormalisedViews
 
 
 @dataclass(frozen=True)
@@ -50,49 +51,6 @@ class Terms:
     handedness: Tensor
     bones: Tensor
     nuclear: Tensor
-
-
-@dataclass(frozen=True)
-class Views:
-    """Image points of a batch as the networks see them, and how they lay in the image.
-
-    Attributes:
-        W: (N,2,P) centred on the mean of the visible points; 0 where hidden.  Of root mean square distance 1, or, where
-            all views have one scale, divided by one number.
-        visible: (N,P) bool.
-        centre, size: (N,2,1) and (N,1,1), ``size * W + centre`` are the image points before that.
-        facing: (N,1,1), 1, or -1 where a view was mirrored: it shows the object from behind, so near and far change.
-        calibrated: the image points are rays, (x/z, y/z) of a pinhole camera looking at the object.
-    """
-
-    W: Tensor
-    visible: Tensor
-    centre: Tensor
-    size: Tensor
-    facing: Tensor
-    calibrated: bool
-
-    @classmethod
-    def of(cls, image: Tensor, visible: Tensor, facing: Tensor, calibrated: bool, unit: float | None = None) -> Views:
-        """Normalise image points (N,2,P); the torch twin of ``paul_ros.model.normalise``.
-
-        Args:
-            unit: what all views are divided by, in units of the image; None: each by its own size.
-        """
-        seen = visible[:, None].to(image.dtype)
-        count = seen.sum(2, keepdim=True)
-        middle = (image * seen).sum(2, keepdim=True) / count
-        offset = (image - middle) * seen
-        if unit is None:
-            size = (offset.square().sum((1, 2), keepdim=True) / count).sqrt().clamp_min(1e-9)
-        else:
-            size = torch.full_like(count, unit)
-        return cls(offset / size, visible, middle, size, facing, calibrated)
-
-    def __getitem__(self, part: slice) -> Views:
-        """Some of the views."""
-        arrays = (self.W, self.visible, self.centre, self.size, self.facing)
-        return Views(*(array[part] for array in arrays), self.calibrated)
 
 
 @dataclass(frozen=True)
@@ -115,7 +73,7 @@ class Fit:
     points: Tensor
 
 
-def fit(networks: Paul, recipe: Recipe, views: Views, rows: Tensor) -> Fit:
+def fit(networks: Paul, recipe: Recipe, views: NormalisedViews, rows: Tensor) -> Fit:
     """Decode a batch and solve its cameras (equations 8-10); rows (N,) are the frames' numbers, for free codes."""
     W, visible = views.W, views.visible
     code = networks.codes(W, visible, rows)
@@ -150,7 +108,7 @@ def _camera(streams: Tensor, W: Tensor, visible: Tensor, recipe: Recipe) -> Came
 
 
 def paul_terms(
-    networks: Paul, layout: Layout, recipe: Recipe, views: Views, rows: Tensor, share: Share = WHOLE
+    networks: Paul, layout: Layout, recipe: Recipe, views: NormalisedViews, rows: Tensor, share: Share = WHOLE
 ) -> Terms:
     """Evaluate the objective on a batch, or on this process's share of it: terms are always those of the batch."""
     found = fit(networks, recipe, views, rows)
@@ -159,7 +117,13 @@ def paul_terms(
 
 
 def regression_terms(
-    networks: Paul, layout: Layout, recipe: Recipe, views: Views, rows: Tensor, S: Tensor, share: Share = WHOLE
+    networks: Paul,
+    layout: Layout,
+    recipe: Recipe,
+    views: NormalisedViews,
+    rows: Tensor,
+    S: Tensor,
+    share: Share = WHOLE,
 ) -> Terms:
     """The same objective with known canonical shapes S (N,3,P) in place of R^T [W; z]: equation 3, supervised."""
     code = networks.codes(views.W, views.visible, rows)
@@ -203,7 +167,7 @@ def _terms(
 
 
 @torch.no_grad()
-def undo_perspective(views: Views, depth: Tensor) -> Tensor:
+def undo_perspective(views: NormalisedViews, depth: Tensor) -> Tensor:
     """The points (N,2,P) that a weak-perspective camera would have seen, given relative depths (N,1,P) in units of W.
 
     A pinhole camera sees u = X / (d + Z); hence u (1 + Z/d) = X/d is what weak perspective of distance d sees.  Beyond

@@ -19,11 +19,13 @@ from paul_ros.files import read_npz, write_atomically
 from training.data import TrainingData, check_sizes
 from training.distributed import processes
 from training.errors import DataError, TrainingError
-from training.objective import Views, fit, paul_terms
+from training.objective import fit, paul_terms
+from training.progress import Progress
 from training.recipe import Recipe
 from training.solver import centre
-from training.start.kept_start import START_UNIT, Progress
+from training.start.search import START_UNIT
 from training.trainer import Trainer
+from training.views import NormalisedViews
 
 _BATCH = 256
 _START_SHARE = 0.3  # of the work, as progress tells it
@@ -215,12 +217,12 @@ def _batches(frames: int) -> Iterator[torch.Tensor]:
     return iter(torch.arange(frames).split(_BATCH))
 
 
-Lift = Callable[[Tensor, Views], tuple[Tensor, Tensor, Tensor | None]]
+Lift = Callable[[Tensor, NormalisedViews], tuple[Tensor, Tensor, Tensor | None]]
 """Frames' numbers (N,) and views to shapes (N,3,P) in camera frame and units of W, rotations (N,3,3), codes (N,K)."""
 
 
 def _by_networks(trainer: Trainer) -> Lift:
-    def lift(rows: Tensor, views: Views) -> tuple[Tensor, Tensor, Tensor]:
+    def lift(rows: Tensor, views: NormalisedViews) -> tuple[Tensor, Tensor, Tensor]:
         found = fit(trainer.networks, trainer.recipe, views, rows.to(trainer.device))
         return found.points, found.camera.R, found.code
 
@@ -238,7 +240,7 @@ def _by_start(trainer: Trainer) -> Lift:
             f"regression_steps, so that networks reconstruct them all"
         )
 
-    def lift(rows: Tensor, views: Views) -> tuple[Tensor, Tensor, None]:
+    def lift(rows: Tensor, views: NormalisedViews) -> tuple[Tensor, Tensor, None]:
         R, S = (torch.from_numpy(array[place[rows]]).to(views.W) for array in (start.rotations, start.shapes))
         return START_UNIT[trainer.recipe.scale] * R @ S, R, None
 

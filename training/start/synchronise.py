@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.start.kept_start import Progress
-from training.start.linear_model import LinearModel, Observations
+from training.progress import Progress
+from training.start.linear_model import LinearModel
+from training.start.observations import Observations
 
 _AGREEING = 0.995  # of nearest neighbours: 1.00 on sequences of one camera path; 0.98 where a third is mirrored
 _FLAT = 1e-4

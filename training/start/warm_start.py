@@ -17,15 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from training.errors import StartError
-from training.start.kept_start import Progress
-from training.start.linear_model import LinearModel, Moments, Observations, centred_on_visible, random_rotations
+from training.progress import Progress
+from training.start.linear_model import LinearModel, random_rotations
+from training.start.moments import Moments
+from training.start.observations import Observations, centred_on_visible
+from training.start.start import Start
 from training.start.synchronise import synchronised
 
 _STARTS = 48
@@ -48,23 +50,6 @@ _RIGID_NOISE = 0.01
 _DOUBT_MARGIN = 1.25
 _BLOCK = 512  # points
 _EXTENSION_RIDGE = 1e-3
-
-
-class Start(NamedTuple):
-    """Shapes to begin with.
-
-    Attributes:
-        rows: (n,) the frames they belong to.
-        shapes: (n,3,P) canonical frame, units of W, centred on the visible points: ``rotations @ shapes`` fits W.
-        rotations: (n,3,3), det +1, from the canonical to the camera frame. Which of the two mirror images of all this
-            is right, orthographic views do not tell.
-        score: mean negative log likelihood of a frame, lower is better; comparable between seeds.
-    """
-
-    rows: np.ndarray
-    shapes: np.ndarray
-    rotations: np.ndarray
-    score: float
 
 
 @contextmanager
