@@ -18,14 +18,16 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from training.data import load_training_data
 from training.export import export_model
 from training.judge.truth import load_sequence
-from training.people.human_data import make_file
+from training.loading import load_training_data
+from training.people.human_data import make_file, views_of
 from training.people.mocap import human_layout
 from training.recipe import Recipe
 from training.reconstruction import final_loss
-from training.start.kept_start import START_UNIT, Start, kept_start, start_identity
+from training.start.kept_start import kept_start, start_identity
+from training.start.search import START_UNIT
+from training.start.start import Start
 from training.start.synchronise import aligned
 from training.trainer import Trainer
 
@@ -50,7 +52,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     recipe, run = Recipe.load("human", args.set), args.output / "run"
-    make_file(args.folder, recipe.views, args.output / "2d.npz", args.output / "3d.npz")
+    make_file(args.folder, views_of(recipe), args.output / "2d.npz", args.output / "3d.npz")
     steps = recipe.regression_steps + recipe.steps
     recipe = replace(recipe, views=None, regression_steps=steps - 1, steps=1)  # without any there would be no networks
     data = load_training_data(args.output / "2d.npz", human_layout())

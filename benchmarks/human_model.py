@@ -30,7 +30,7 @@ from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifted, Lifter
 from paul_ros.model import DEFAULT_MODEL, load_model
 from training.judge.pictures import COLOURS, new_figure, save_figure, titled
-from training.people.human_data import HELD_OUT, Seen, read_clips, see
+from training.people.human_data import HELD_OUT, Seen, read_clips, see, views_of
 from training.people.mocap import human_layout, human_points
 from training.recipe import Recipe
 
@@ -72,7 +72,7 @@ CONDITIONS = (
 def seen_as(points: np.ndarray, condition: Condition, seed: int = 0) -> Seen:
     """Views of bodies (N,43,3) under a condition."""
     views = replace(
-        Recipe.load("human").views,
+        views_of(Recipe.load("human")),
         layouts=((condition.layout, 1.0),),
         level=(condition.level,) * 2,
         hidden=(condition.hidden,) * 2,

@@ -15,8 +15,9 @@ from paul_ros.layout import load_layout
 from paul_ros.offline.bag import BagWriter
 from paul_ros.placement import centred_view
 from training import data as module
-from training.data import check_sizes, load_training_data
+from training.data_checks import check_sizes
 from training.errors import DataError
+from training.loading import load_training_data
 
 
 def views(frames=6, points=9, seed=0):

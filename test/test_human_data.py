@@ -15,13 +15,13 @@ import pytest
 from test_distributed import TORCHRUN
 
 from msg_adapters.keypoints import Intrinsics
+from paul_ros.cli import train as cli
 from paul_ros.errors import LayoutError
 from paul_ros.layout import load_layout
 from paul_ros.model import load_model
 from paul_ros.placement import centred_view
-from training import command as cli
-from training.data import load_training_data
 from training.errors import DataError, MocapError, RecipeError, ViewsError
+from training.loading import load_training_data
 from training.people import human_data
 from training.people.cameras import hidden_by_body, random_cameras
 from training.people.detector import detect, redefined, reported
@@ -577,7 +577,7 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
     ],
 )
 def test_what_can_be_told_is_told_before_views_are_made(archive, tmp_path, monkeypatch, words, error, told):
-    monkeypatch.setattr(cli, "make_file", lambda *given, **named: pytest.fail("views were made"))
+    monkeypatch.setattr(human_data, "make_file", lambda *given, **named: pytest.fail("views were made"))
     with pytest.raises(error, match=told):
         cli.run(arguments_of_train(archive, "-o", tmp_path / "human.npz", "--recipe", "human", *words))
 

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from paul_ros.errors import NpzError
 from paul_ros.files import read_npz, write_atomically
-from training.data import TrainingData, check_sizes
+from training.data import TrainingData
+from training.data_checks import check_sizes
 from training.distributed import processes
 from training.errors import DataError, TrainingError
 from training.objective import fit, paul_terms
@@ -85,7 +86,7 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
 
 
 @dataclass(frozen=True)
-class Run:
+class FinishedRun:
     """A finished run and its loss, as in ``Reconstruction``; infinite where it diverged."""
 
     trainer: Trainer
@@ -103,7 +104,7 @@ Watch = Callable[[Trainer], None]
 
 def train_restarts(
     data: TrainingData, recipe: Recipe, folder: Path, device: torch.device | str, watch: Watch
-) -> list[Run]:
+) -> list[FinishedRun]:
     """Train the recipe's restarts one after the other, each in a folder of its own; best first, diverged ones last.
 
     Raises:
@@ -120,9 +121,9 @@ def train_restarts(
             if unusable or processes() > 1:  # a start that cannot be read; or others wait for this process
                 raise
             diverged = error
-            runs.append(Run(trainer, math.inf))
+            runs.append(FinishedRun(trainer, math.inf))
         else:
-            runs.append(Run(trainer, final_loss(trainer)))
+            runs.append(FinishedRun(trainer, final_loss(trainer)))
     if diverged and all(math.isinf(run.loss) for run in runs):
         raise diverged
     return sorted(runs, key=lambda run: run.loss)
@@ -174,7 +175,7 @@ def reconstruct(
 
 
 @torch.no_grad()
-def reconstruction_of(runs: list[Run]) -> Reconstruction:
+def reconstruction_of(runs: list[FinishedRun]) -> Reconstruction:
     """What the first of the runs, the best, makes of its frames.
 
     Raises:

@@ -697,23 +697,13 @@ def _training_packages() -> Iterator[None]:
         raise ImportError(f"this needs the Python package '{error.name}': pip install 'paul_ros[train]'") from error
 
 
-def _add_train(commands: argparse._SubParsersAction, wanted: bool) -> None:
-    parser = commands.add_parser(
-        "train",
-        help="learn a 3D model of any object from 2D keypoints alone",
-        description="Learn a 3D shape model from 2D keypoints alone.",
-    )
-    if not wanted:
-        return  # its options live beside torch, which takes seconds to import
-    try:
-        from training import command as cli
-    except ImportError as error:
-        raise ImportError(f"training needs the Python package '{error.name}': pip install 'paul_ros[train]'") from error
-    cli.add_arguments(parser)
-    parser.set_defaults(run=cli.run)
+def _add_train(commands: argparse._SubParsersAction) -> None:
+    from paul_ros.cli import train
+
+    train.add_parser(commands)
 
 
-def _parser(train: bool) -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="paul",
         description="3D from the 2D keypoints of any object, learned from 2D alone.",
@@ -724,7 +714,7 @@ def _parser(train: bool) -> argparse.ArgumentParser:
     _add_replay(commands)
     _add_view(commands)
     _add_inspect(commands)
-    _add_train(commands, train)
+    _add_train(commands)
     _add_evaluate(commands)
     _add_study(commands)
     _add_demo(commands)
@@ -758,7 +748,7 @@ def _run(argv: list[str]) -> int:
     if not train:  # training has --threads for it
         _use_one_thread()
     try:
-        args = _parser(train).parse_args(argv)
+        args = _parser().parse_args(argv)
         args.run(args)
     except KeyboardInterrupt as stop:
         print(f"paul: {str(stop) or 'stopped'}", file=sys.stderr)

@@ -29,10 +29,11 @@ from paul_ros.files import write_atomically
 from paul_ros.layout import anonymous_layout
 from paul_ros.model import enough_visible
 from training import reconstruction
-from training.data import TrainingData, load_training_data
+from training.data import TrainingData
 from training.errors import DataError, RecipeError
 from training.judge.evaluation import LEAST_VISIBLE, errors_of_signs
 from training.judge.truth import Sequence
+from training.loading import load_training_data
 from training.recipe import Recipe
 from training.reconstruction import Reconstruction
 from training.start.kept_start import START, start_identity

@@ -30,7 +30,7 @@ from paul_ros.files import read_npz, write_atomically
 from paul_ros.model import enough_visible
 from paul_ros.offline.bag import check_outputs
 from paul_ros.placement import centred_view
-from training.errors import MocapError, RecipeError
+from training.errors import MocapError, RecipeError, ViewsError
 from training.people.asf_amc import Skeleton, read_amc, read_asf
 from training.people.bvh import read_bvh
 from training.people.cameras import Cameras, hidden_by_body, random_cameras
@@ -451,10 +451,17 @@ def check_outside(folder: Path, outputs: Iterable[Path | None]) -> None:
 
 
 def views_of(recipe: Recipe) -> Views:
-    """The recipe's views; raises RecipeError where it has none."""
+    """Return the recipe's settings of views.
+
+    Raises:
+        RecipeError: it has none, or they cannot be used.
+    """
     if recipe.views is None:
         raise RecipeError("a folder of motion capture needs a recipe that says how people are seen: --recipe human")
-    return recipe.views
+    try:
+        return Views.from_dict(recipe.views)
+    except ViewsError as error:
+        raise RecipeError(str(error)) from None
 
 
 def _save(path: Path, arrays: dict[str, np.ndarray]) -> None:

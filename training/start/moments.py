@@ -120,7 +120,7 @@ class Moments(ABC):
         return torch.from_numpy(poses.R[:, 0])
 
     def _system(self, G: Tensor, R: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the linear system of the codes: H (F,K,K), h (F,K), and the squared residual (F,) of the mean shape."""
+        """Return the system of the codes, H (F,K,K) and h (F,K), and the squared residual (F,) of the mean shape."""
         along = torch.einsum("fai,faki->fk", R[:, :2], self.cross)
         H = G[:, 1:, 1:] + sigma**2 * torch.eye(self.bases - 1, dtype=G.dtype)
         return H, along[:, 1:] - G[:, 0, 1:], self.seen.power - 2 * along[:, 0] + G[:, 0, 0]

@@ -14,10 +14,10 @@ from paul_ros.offline.replay import versions
 from paul_ros.offline.report import write_json
 from paul_ros.onp import onp
 from training.categories import among_categories
-from training.data import load_training_data
 from training.errors import DataError
 from training.judge.pictures import bare, between, draw_shape, new_figure, save_figure, turned_view
 from training.judge.truth import Sequence
+from training.loading import load_training_data
 
 _SHAPES = 9
 _DRAWN = ("shapes", "seen", "edges")
