@@ -20,6 +20,7 @@ from paul_ros.errors import LayoutError
 from paul_ros.layout import load_layout
 from paul_ros.model import load_model
 from paul_ros.placement import centred_view
+from training import motion_capture
 from training.errors import DataError, MocapError, RecipeError, ViewsError
 from training.loading import load_training_data
 from training.people import human_data
@@ -577,7 +578,7 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
     ],
 )
 def test_what_can_be_told_is_told_before_views_are_made(archive, tmp_path, monkeypatch, words, error, told):
-    monkeypatch.setattr(human_data, "make_file", lambda *given, **named: pytest.fail("views were made"))
+    monkeypatch.setattr(motion_capture, "make_file", lambda *given, **named: pytest.fail("views were made"))
     with pytest.raises(error, match=told):
         cli.run(arguments_of_train(archive, "-o", tmp_path / "human.npz", "--recipe", "human", *words))
 

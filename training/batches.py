@@ -38,8 +38,8 @@ class Batch:
 class BatchSampler:
     """Draws batches; equal states of the generator give equal batches on all devices and numbers of processes.
 
-    Views are turned and mirrored anew in every batch. That leaves the canonical shape as it is, except for a mirrored
-    object, whose shape is mirrored as well.
+    Views are turned and mirrored anew in every batch. Canonical shapes stay as they are, except those of mirrored
+    objects, which are mirrored as well.
 
     Args:
         frames: the training frames.

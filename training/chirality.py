@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the two mirror images shapes are, by the layout's handedness rules or by agreement with their mean."""
+"""The mirror image of shapes, by the layout's handedness rules or by agreement with their mean."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def rule_share(shapes: np.ndarray, layout: Layout) -> float | None:
 def same_side_share(shapes: np.ndarray, mean: np.ndarray) -> float:
     """Return the share of shapes (F,3,P) that rotate onto the mean (3,P) better than their mirror images do.
 
-    With the singular values a >= b >= c of S mean^T, S fits by a + b +- c and its mirror image by a + b -+ c; the sign
-    is that of the determinant.
+    Let a >= b >= c be the singular values of S mean^T. S fits by a + b +- c, and its mirror image by a + b -+ c. The
+    sign is that of the determinant.
     """
     return float((np.linalg.det(shapes @ mean.T) > 0).mean())

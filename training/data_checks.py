@@ -145,8 +145,7 @@ def _notes(visible: np.ndarray, layout: Layout, guessed: bool) -> tuple[str, ...
             f"{frames} frames of {points} points leave the depth open: even a rigid object needs "
             f"{_LEAST_FRAMES} frames of {_LEAST_POINTS} points"
         )
-    ever: list[bool] = visible.any(0).tolist()
-    never = [name for name, seen in zip(layout.names, ever) if not seen]
+    never = [name for point, name in enumerate(layout.names) if not visible[:, point].any()]
     if never:
         more = f" and {len(never) - _NAMED_POINTS} more" if len(never) > _NAMED_POINTS else ""
         named = ", ".join(never[:_NAMED_POINTS])

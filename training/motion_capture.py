@@ -14,7 +14,7 @@ from training.distributed import from_first
 from training.errors import DataError, MocapError
 from training.loading import load_training_data
 from training.options import TrainingOptions
-from training.people import human_data
+from training.people.human_data import check_outside, make_file, motion_files, views_of
 from training.people.mocap import human_layout
 from training.preflight import check_recipe
 from training.recipe import Recipe
@@ -25,7 +25,7 @@ VIEWS_FILE = "views.npz"
 
 def is_motion_capture(folder: Path) -> bool:
     """Return whether the folder holds files of motion capture."""
-    return bool(human_data.motion_files(folder))
+    return bool(motion_files(folder))
 
 
 def check_motion_capture(options: TrainingOptions) -> None:
@@ -34,7 +34,7 @@ def check_motion_capture(options: TrainingOptions) -> None:
     Raises:
         MocapError: the next run would take an output for motion capture.
     """
-    human_data.check_outside(options.data[0], options.outputs)
+    check_outside(options.data[0], options.outputs)
 
 
 def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
@@ -55,7 +55,7 @@ def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.
         DataError: the layout has other points than motion capture gives.
         MocapError: the files cannot be used.
     """
-    settings, path = human_data.views_of(recipe), options.run_folder / VIEWS_FILE
+    settings, path = views_of(recipe), options.run_folder / VIEWS_FILE
     own = human_layout()
     layout = load_layout(options.layout) if options.layout else own
     if len(own.names) != len(layout.names):
@@ -70,7 +70,7 @@ def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.
         try:
             if options.fresh:
                 path.unlink(missing_ok=True)
-            human_data.make_file(options.data[0], settings, path, quiet=options.quiet)
+            make_file(options.data[0], settings, path, quiet=options.quiet)
         except (MocapError, OSError) as error:
             return str(error).encode()
         return None

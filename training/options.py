@@ -11,7 +11,7 @@ from training.errors import DataError
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """What to train on, how, and what to write.
+    """Data, settings and outputs of a session.
 
     Attributes:
         data: npz files or bags, or one folder of motion capture.

@@ -43,8 +43,8 @@ def train(options: TrainingOptions) -> None:
     """
     recipe = Recipe.load(options.recipe, options.overrides)
     folders = [run_folder(options.run_folder, recipe, one.seed) for one in restarts(recipe)]
-    check_options(options, recipe, folders)
     check_data(options)
+    check_options(options, recipe, folders)
     torch.set_num_threads(options.threads)
     device = training_device(options.device)
     with joined(device):
