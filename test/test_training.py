@@ -214,8 +214,10 @@ def test_frames_with_too_few_points_are_left_out_and_counted(tmp_path):
         ("batch", "key=value"),
         ("width=-4", "positive"),
         ("hide=0.3", "unknown recipe setting hide; known are bottleneck"),
-        ("seed=-1", "seed must be from 0"),
-        ("seed=1e12", "seed must be from 0"),
+        ("seed=-1", "seed must be at least 0"),
+        ("seed=1e12", "seed must be at most 4294967295"),
+        ("batch=1e9", "batch must be at most"),
+        ("restarts=1e9", "restarts must be at most"),
         ("stature=1e7", "stature must be 0, or metres"),
         ("views=5", "views must be settings as key: value"),
     ],
@@ -235,9 +237,10 @@ def test_the_data_is_never_overwritten_by_the_model(data_file):
 
 
 @pytest.mark.parametrize("override", ["width=5000", "blocks=101", "bottleneck=20000"])
-def test_models_that_could_not_be_loaded_are_refused_before_training(data_file, tmp_path, override):
+@pytest.mark.parametrize("option", ["-o", "--shapes"])
+def test_networks_too_large_for_a_model_file_are_refused_before_training(data_file, tmp_path, override, option):
     with pytest.raises(ModelError, match="could not be loaded"):
-        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", override)
+        train(data_file, option, tmp_path / "m.npz", *SMALL, "--set", override)
     assert not list((tmp_path / "m.run").glob("*"))
 
 

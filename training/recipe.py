@@ -31,10 +31,10 @@ CHOICES = {
 
 _POSITIVE = ("bottleneck", "width", "blocks", "learning_rate", "code_learning_rate", "restarts", "generations")
 _NOT_NEGATIVE = (
-    *("steps", "regression_steps", "hold", "batch", "roll"),
+    *("steps", "regression_steps", "hold", "batch", "seed", "roll"),
     *("code_weight", "decay_weight", "nuclear_weight", "handedness_weight", "bone_weight"),
 )
-_MAX_SEED = 2**32 - 1
+_LARGEST = {"seed": 2**32 - 1, "batch": 2**20, "restarts": 10_000}
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,8 @@ class Recipe:
             self._need(name, getattr(self, name) > 0, "positive")
         for name in _NOT_NEGATIVE:
             self._need(name, getattr(self, name) >= 0, "at least 0")
-        self._need("seed", 0 <= self.seed <= _MAX_SEED, f"from 0 to {_MAX_SEED}")
+        for name, largest in _LARGEST.items():
+            self._need(name, getattr(self, name) <= largest, f"at most {largest}")
         self._need("stature", not self.stature or 1e-3 <= self.stature < 1e3, "0, or metres from 0.001 to 1000")
         self._need("hidden", self.hidden and all(type(size) is int and size > 0 for size in self.hidden), "layer sizes")
         self._check_together()

@@ -42,8 +42,8 @@ class Reconstruction:
     Attributes:
         used: (G,) bool over the given frames: True for the F that are reconstructed, in their order. The others showed
             too few points.
-        shapes: (F,3,P) float32, image units, centred on the visible points. Coordinates x and y of visible points are the
-            observed ones. All others are the mean of the streams (S_cam of the paper; supplement, equation 14).
+        shapes: (F,3,P) float32, image units, centred on the visible points. x and y of visible points are the observed
+            ones. All other coordinates are the mean of the streams (S_cam of the paper; supplement, equation 14).
         rotations: (F,3,3) float32, from the canonical to the camera frame.
         codes: (F,K) float32; None if no networks were trained.
         loss: objective over all frames without augmentation, or the score of the start if no networks were trained.

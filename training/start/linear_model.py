@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A linear Gaussian Procrustean shape model of 2D frames: probabilistic principal components under unknown cameras.
 
-Frame f is seen as ``W = R (V_0 + sum_k c_k V_k) + t + noise`` with codes c ~ N(0, I) and isotropic noise of
-deviation sigma. The camera R is orthographic, of unit scale; the translation t is free. Codes and translations integrate out in closed
-form. Expectation maximisation fits the bases V and the rotations R; L-BFGS polishes them. The family of models is that
-of Lee et al., "Procrustean Normal Distribution for Non-Rigid Structure from Motion", 2013.
+Frame f is seen as ``W = R (V_0 + sum_k c_k V_k) + t + noise`` with codes c ~ N(0, I) and isotropic noise of deviation
+sigma. The camera R is orthographic, of unit scale; the translation t is free. Codes and translations integrate out in
+closed form. Expectation maximisation fits the bases V and the rotations R; L-BFGS polishes them. The family of models
+is that of Lee et al., "Procrustean Normal Distribution for Non-Rigid Structure from Motion", 2013.
 
 The caller anneals sigma. It is never learned: a learned sigma runs away from good solutions.
 """
