@@ -26,14 +26,16 @@ import torch
 from paul_ros.errors import PaulError
 from paul_ros.files import write_atomically
 from paul_ros.metrics import normalised_error_of_signs
-from training.data import load_training_data
 from training.judge.pictures import COLOURS, legend_above, new_figure, save_figure, titled
 from training.judge.truth import Sequence, load_sequence
-from training.objective import Views, fit
+from training.loading import load_training_data
+from training.objective import fit
 from training.recipe import Recipe
-from training.start.kept_start import Start, kept_start, start_identity
+from training.start.kept_start import kept_start, start_identity
+from training.start.start import Start
 from training.start.synchronise import aligned
 from training.trainer import Trainer
+from training.views import NormalisedViews
 
 JUDGED = 3000  # frames, evenly chosen
 STARTS = {"2D": "from 2D alone", "truth": "from the true 3D"}
@@ -58,7 +60,7 @@ def errors(trainer: Trainer, truth: Sequence) -> dict[str, float]:
     rows = np.linspace(0, len(truth.W) - 1, min(JUDGED, len(truth.W))).astype(int)
     W, visible = torch.from_numpy(truth.W[rows]).float(), torch.from_numpy(truth.visible[rows])
     unit = trainer.data.image_unit if trainer.recipe.scale == "unit" else None
-    views = Views.of(W, visible, torch.ones(len(rows), 1, 1), False, unit)
+    views = NormalisedViews.of(W, visible, torch.ones(len(rows), 1, 1), False, unit)
     found = fit(trainer.networks, trainer.recipe, views, torch.from_numpy(rows))
     shapes = {"observed": found.points, "predicted": found.streams[-1]}
     signs = {

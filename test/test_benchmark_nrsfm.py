@@ -21,8 +21,8 @@ from training.judge.published import NORMALISED_ERROR_PERCENT, published
 from training.judge.truth import Sequence
 from training.recipe import Recipe
 from training.reconstruction import Reconstruction
-from training.start import kept_start as starting
-from training.start.kept_start import Start
+from training.start import search as starting
+from training.start.start import Start
 
 FRAMES, POINTS = 9, 14
 

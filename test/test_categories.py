@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from tiny_data import FROM_RANDOM_WEIGHTS
 
+from paul_ros.cli import train as cli
 from paul_ros.layout import Layout, anonymous_layout, load_layout
-from paul_ros.lifted import TOO_FEW_POINTS
-from paul_ros.lifter import Lifter
-from paul_ros.model_file import load_model
-from training import command as cli
+from paul_ros.lifter import TOO_FEW_POINTS, Lifter
+from paul_ros.model import load_model
 from training.categories import among_categories, joint_layout, load_files
 from training.errors import DataError
 from training.judge.evaluation import evaluate_model
 from training.judge.truth import load_sequence
 from training.networks import build_networks
-from training.objective import Views, own_points, paul_terms
+from training.objective import own_points, paul_terms
 from training.recipe import Recipe
+from training.views import NormalisedViews
 
 SMALL = [word for item in ("steps=8", "width=16", "batch=8", "bottleneck=3") for word in ("--set", item)]
 
@@ -132,7 +132,7 @@ def test_what_other_categories_have_costs_nothing(garage, scale):
     networks = build_networks(data.layout, recipe, 25)
     W, visible = torch.from_numpy(data.W[:20]), torch.from_numpy(data.visible[:20]).clone()
     visible[:, 6] = False
-    views = Views.of(W, visible, torch.ones(20, 1, 1), False, data.image_unit if scale == "unit" else None)
+    views = NormalisedViews.of(W, visible, torch.ones(20, 1, 1), False, data.image_unit if scale == "unit" else None)
     weights = networks.decoder[-1].weight.data.view(3, 90, -1)
     networks.shape_encoder[0].weight.data.view(-1, 3, 90)[:, :, 7:] = 0  # else f_e tells one stream of every point
 
@@ -160,7 +160,7 @@ def test_own_points_are_those_of_the_category_that_is_seen(garage):
 
 
 def test_a_model_of_several_categories_trains_and_lifts_each(garage, tmp_path):
-    train(*garage, "-o", tmp_path / "m.npz", "--set", "hide=0.5")
+    train(*garage, "-o", tmp_path / "m.npz")
     model = load_model(tmp_path / "m.npz")
     assert model.layout.categories.keys() == {"car", "bus"} and model.min_visible == 4
     xy, visible = np.full((3, 90, 2), np.nan), np.zeros((3, 90), bool)

@@ -12,11 +12,13 @@ from test_foreign_bags import BODIES, FRAMES, IDS, PIXELS, Factory, image_messag
 
 from msg_adapters import read_camera_info
 from paul_ros.layout import load_layout
-from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.model import enough_visible
+from paul_ros.offline.bag import BagWriter
 from paul_ros.placement import centred_view
 from training import data as module
-from training.data import check_sizes, load_training_data
+from training.data_checks import check_sizes
 from training.errors import DataError
+from training.loading import load_training_data
 
 
 def views(frames=6, points=9, seed=0):
@@ -166,7 +168,7 @@ def test_layouts_are_guessed_by_the_number_of_points(tmp_path):
 def test_what_is_loaded_is_what_was_given(tmp_path_factory, frames, points, hidden, seed):
     rng = np.random.default_rng(seed)
     W, visible = views(frames, points, seed), rng.random((frames, points)) >= hidden
-    keeps = module.enough_visible(visible, load_layout(f"points{points}"))
+    keeps = enough_visible(visible, load_layout(f"points{points}"))
     if not keeps.any() or keeps.sum() < 2:
         return
     folder = tmp_path_factory.mktemp("data")

@@ -13,16 +13,17 @@ import torch
 from tiny_data import sequence, true_start
 
 from paul_ros.layout import load_layout
-from training.data import load_training_data
+from training.checkpoint import LOG_COLUMNS
 from training.distributed import WHOLE, from_first, is_first, share_of
+from training.loading import load_training_data
 from training.recipe import Recipe
-from training.start import kept_start as starting
-from training.trainer import LOG_COLUMNS, Trainer
+from training.start import search as starting
+from training.trainer import Trainer
 
 COCO = load_layout("coco17")
 ROOT = Path(__file__).resolve().parent.parent
 RECIPE = {
-    **{"bottleneck": 3, "hidden": [8, 16], "width": 16, "blocks": 1, "batch": 9, "hide": 0.3, "mirror_object": True},
+    **{"bottleneck": 3, "hidden": [8, 16], "width": 16, "blocks": 1, "batch": 9, "mirror_object": True},
     "learning_rate": 0.02,
     **{"start": "linear", "regression_steps": 10, "steps": 20, "nuclear_weight": 0.01, "decay_weight": 0.1},
 }

@@ -14,8 +14,9 @@ from paul_ros.model_file import load_model
 from paul_ros.orthographic_n_point import onp
 from training import export
 from training.categories import joint_layout
-from training.data import load_training_data
-from training.export import export_model, same_side_share
+from training.chirality import same_side_share
+from training.export import export_model
+from training.loading import load_training_data
 from training.recipe import Recipe
 from training.trainer import Trainer
 

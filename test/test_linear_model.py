@@ -8,13 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from training.start.linear_model import (
-    LinearModel,
-    Moments,
-    Observations,
-    random_rotations,
-    rotations_of,
-)
+from training.start.linear_model import LinearModel, random_rotations, rotations_of
+from training.start.moments import Moments
+from training.start.observations import Observations
 
 FRAMES, POINTS, BASES, SIGMA = 12, 9, 3, 0.3
 GENERATORS = (

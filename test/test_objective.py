@@ -12,17 +12,10 @@ from tiny_data import sequence
 
 from paul_ros.layout import load_layout
 from training.networks import build_networks
-from training.objective import (
-    Views,
-    bone_variation,
-    fit,
-    handedness_violation,
-    paul_terms,
-    regression_terms,
-    undo_perspective,
-)
+from training.objective import bone_variation, fit, handedness_violation, paul_terms, regression_terms, undo_perspective
 from training.recipe import Recipe
 from training.solver import algebraic_camera, centre
+from training.views import NormalisedViews
 
 COCO = load_layout("coco17")
 BARE = {"handedness_weight": 0, "bone_weight": 0, "hidden": [8, 16], "width": 16, "bottleneck": 4}
@@ -37,7 +30,7 @@ def one_thread():
 
 
 def batch(image, visible, calibrated=False, unit=None):
-    return Views.of(image, visible, torch.ones(len(image), 1, 1, dtype=image.dtype), calibrated, unit)
+    return NormalisedViews.of(image, visible, torch.ones(len(image), 1, 1, dtype=image.dtype), calibrated, unit)
 
 
 def case(hidden, recipe=PAPER, frames=8):
@@ -213,7 +206,7 @@ def test_undone_perspective_is_weak_perspective(facing):
     distance = torch.tensor([2.0, 3, 4, 5, 6], dtype=torch.double)[:, None, None]
     image = S[:, :2] / (distance + S[:, 2:])
     visible = torch.ones(5, 17, dtype=torch.bool)
-    seen = Views.of(image, visible, torch.full((5, 1, 1), facing, dtype=torch.double), True)
+    seen = NormalisedViews.of(image, visible, torch.full((5, 1, 1), facing, dtype=torch.double), True)
     depth = facing * S[:, 2:] / distance / seen.size
     weak = undo_perspective(seen, depth)
     torch.testing.assert_close(weak, centre(S[:, :2], visible) / distance / seen.size)

@@ -91,7 +91,7 @@ def test_the_example_is_replayed(installed, bag, model_file, tmp_path):
 def test_the_example_is_read_for_training(installed, bag):
     code = """
 import sys
-from training.data import load_training_data
+from training.loading import load_training_data
 print(load_training_data(sys.argv[1]).W.shape)
 """
     assert run(sys.executable, "-c", code, bag, path=[installed]).strip() == "(10, 2, 17)"

@@ -12,16 +12,16 @@ from test_training import train
 from tiny_data import centred, sequence, true_start
 
 from paul_ros import cli as paul
-from paul_ros.errors import BagError
+from paul_ros.errors import BagError, MissingPackageError
 from paul_ros.metrics import normalised_error
-from paul_ros.model_file import load_model
-from training import command as cli
-from training import reconstruction
+from paul_ros.model import load_model
+from training import reconstruction, session
 from training.encoder_fit import fit_encoder
 from training.errors import DataError, RecipeError, TrainingError
 from training.recipe import Recipe
 from training.reconstruction import load_reconstruction, reconstruct, train_restarts
-from training.start import kept_start as starting
+from training.start import search as starting
+from training.start.start import Start
 from training.trainer import Trainer
 
 TINY = {
@@ -50,8 +50,8 @@ def search_for(data, camera, R, score=None, rows=slice(None)):
     def search(kind, W, visible, seed, progress):
         if progress:
             progress(0.5)
-        found = starting.Start(start.rows[rows], start.shapes[rows], start.rotations[rows], float(seed), 2.5)
-        return found if score is None else starting.Start(*list(vars(found).values())[:3], score(seed), 2.5)
+        found = Start(start.rows[rows], start.shapes[rows], start.rotations[rows], float(seed), 2.5)
+        return found if score is None else Start(*list(vars(found).values())[:3], score(seed), 2.5)
 
     return search
 
@@ -90,7 +90,7 @@ def test_without_steps_the_starts_shapes_are_the_result(monkeypatch):
             size = np.sqrt((centred(camera, data.visible)[:, :2] ** 2 * seen).sum((1, 2)) / data.visible.sum(1) / 2)
             start = true_start(*given)
             shapes = start.shapes * (data.image_unit / size)[:, None, None].astype(np.float32)
-            changed = starting.Start(start.rows, shapes, start.rotations, 0.0, 2.5)
+            changed = Start(start.rows, shapes, start.rotations, 0.0, 2.5)
             monkeypatch.setattr(starting, "search", lambda *given: changed)
         found = reconstruct(data, Recipe.from_dict({**STARTED, "regression_steps": 0, "steps": 0, "scale": scale}))
         np.testing.assert_allclose(found.shapes, centred(camera, data.visible), atol=0.02)
@@ -193,7 +193,7 @@ def test_what_is_no_reconstruction_is_refused(tmp_path, case):
 
 @pytest.fixture
 def file(tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "fit_encoder", lambda run, progress: fit_encoder(run, 20, progress))  # it is long
+    monkeypatch.setattr(session, "fit_encoder", lambda run, progress: fit_encoder(run, 20, progress))  # it is long
     data, camera, _ = sequence()
     np.savez(tmp_path / "seq.npz", W=data.W, S=camera)
     return tmp_path / "seq.npz"
@@ -244,12 +244,12 @@ def test_a_gpu_that_is_not_there_is_named(file, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(TrainingError, match="--device cpu"):
         train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--device", "cuda")
-    assert cli._device("auto") == torch.device("cpu")
+    assert session.training_device("auto") == torch.device("cpu")
 
 
 def test_tensorboard_is_asked_for_before_the_first_step(file, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(ImportError, match=r"paul_ros\[tensorboard\]"):
+    monkeypatch.setitem(sys.modules, "tensorboard", None)
+    with pytest.raises(MissingPackageError, match=r"paul_ros\[tensorboard\]"):
         train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--tensorboard")
     assert not list((tmp_path / "m.run").glob("*"))
 
@@ -267,6 +267,7 @@ def test_tensorboard_gets_the_losses(file, tmp_path, monkeypatch):
         def close(self):
             written.append("closed")
 
+    monkeypatch.setitem(sys.modules, "tensorboard", types.SimpleNamespace())
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", types.SimpleNamespace(SummaryWriter=Writer))
     train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--set", "steps=40", "--tensorboard", "--quiet")
     assert begun == [(str(tmp_path / "m.run" / "tensorboard"), 1)] and written[-1] == "closed"
@@ -304,7 +305,7 @@ def test_ctrl_c_during_the_search_or_the_last_fit_says_so(file, tmp_path, monkey
     words = [file, "--shapes", tmp_path / "s.npz", *AS_OPTIONS]
     said = stopped(capsys, *words, "--set", "start=linear", "--set", "steps=0")
     assert said == "paul: stopped while searching for a start: the same command begins again"
-    monkeypatch.setattr(cli, "fit_encoder", interrupt)
+    monkeypatch.setattr(session, "fit_encoder", interrupt)
     said = stopped(capsys, *words, "--fresh", "-o", tmp_path / "m.npz", "--set", "start=random", "--set", "steps=2")
     assert "stopped while fitting the 2D encoder to the codes" in said
     assert load_reconstruction(tmp_path / "s.npz").shapes.shape == (40, 3, 9)

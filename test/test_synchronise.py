@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from paul_ros.metrics import procrustes
 from training.start import synchronise
-from training.start.linear_model import LinearModel, Observations
+from training.start.linear_model import LinearModel
+from training.start.observations import Observations
 from training.start.synchronise import (
     agreeing_share,
     aligned,

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from training.data import load_training_data
 from training.judge.synthetic import _BONES, _skin, _surface, articulated_mesh, mesh_edges
+from training.loading import load_training_data
 
 
 def test_the_same_seed_gives_the_same_body():

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The training loop: its phases, what it keeps, and that any interruption leaves no trace in the weights."""
 
-import csv
 import signal
 from dataclasses import replace
 
@@ -12,15 +11,20 @@ from scipy.spatial.transform import Rotation
 from tiny_data import sequence, true_start
 
 from paul_ros.layout import load_layout
-from paul_ros.orthographic_n_point import onp
-from training import trainer
+from paul_ros.onp import onp
+from training.checkpoint import LOG_COLUMNS
+from training.chirality import rule_share
 from training.encoder_fit import fit_encoder
 from training.errors import RecipeError, TrainingError
-from training.objective import Views, fit
+from training.lesson import Lesson
+from training.objective import fit
+from training.optimiser import one_buffer
 from training.recipe import Recipe
 from training.reconstruction import final_loss
-from training.start import kept_start as starting
-from training.trainer import Trainer, one_buffer, rule_share
+from training.start import search as starting
+from training.start.start import Start
+from training.trainer import Trainer
+from training.views import NormalisedViews, turned_views
 
 COCO = load_layout("coco17")
 TINY = {
@@ -85,7 +89,7 @@ STOPS = [
 @pytest.mark.parametrize("settings, step", STOPS)
 def test_a_run_stopped_anywhere_continues_to_the_bit(tmp_path, searches, step, settings):
     data, _, _ = sequence(hidden=0.2)
-    recipe = Recipe.from_dict({**STARTED, **settings, "roll": 1.0, "hide": 0.3, "patience": 6})
+    recipe = Recipe.from_dict({**STARTED, **settings, "roll": 1.0})
     whole = through(Trainer(data, recipe, tmp_path / "whole"))
     first = Trainer(data, recipe, tmp_path / "parts")
     if step:
@@ -118,7 +122,7 @@ def test_the_networks_learn_the_starts_shapes(tmp_path, searches, codes, scale):
         {**STARTED, "codes": codes, "scale": scale, "regression_steps": 300, "steps": 1, "learning_rate": 3e-3}
     )
     run = through(Trainer(sequence()[0], recipe, tmp_path))
-    rows = [dict(zip(trainer.LOG_COLUMNS, row)) for row in run.rows]
+    rows = [dict(zip(LOG_COLUMNS, row)) for row in run.rows]
     assert [row["phase"] for row in rows] == ["regression"] * 3 + ["unsupervised"]
     first = next(iter(Trainer(sequence()[0], recipe, tmp_path / "other").run()))
     assert rows[2]["recon_ad"] < 0.35 * first["recon_ad"] and rows[2]["recon_ae"] < 0.5 * first["recon_ae"]
@@ -132,7 +136,8 @@ def test_held_solutions_are_those_of_the_lower_level(tmp_path, searches, scale):
     lesson = run._lesson
     S = lesson.shapes_of(torch.arange(40), None).numpy()
     assert onp(S, run.views(torch.arange(40)).W.numpy(), data.visible, scale).residual.max() < 1e-5
-    views, rows, goal, _ = run._batch(trainer.HELD)
+    batch = run._sampler.draw(lesson)
+    views, rows, goal = batch.views, batch.rows, batch.goal
     assert onp(goal.numpy(), views.W.numpy(), views.visible.numpy(), scale).residual.max() < 1e-5
     assert (views.W - run.views(rows).W).abs().max() > 0.1
     masks = {tuple(mask) for mask in data.visible.tolist()}
@@ -142,8 +147,8 @@ def test_held_solutions_are_those_of_the_lower_level(tmp_path, searches, scale):
 
 def test_held_solutions_are_renewed_as_the_recipe_says(tmp_path, searches, monkeypatch):
     renewed = []
-    made = Trainer._held
-    monkeypatch.setattr(Trainer, "_held", lambda run, phase: renewed.append(run.step) or made(run, phase))
+    made = Trainer._solutions
+    monkeypatch.setattr(Trainer, "_solutions", lambda run: renewed.append(run.step) or made(run))
     run = through(Trainer(sequence()[0], Recipe.from_dict({**HELD, "steps": 5}), tmp_path))
     assert renewed == [6, 8, 10]
     assert [row[-1] for row in run.rows] == ["regression", "held"]
@@ -168,14 +173,12 @@ def test_the_next_generation_starts_afresh_from_what_the_last_explained_best(tmp
 def test_rates_stay_high_for_half_a_generation_of_held_solutions(tmp_path):
     settings = {"regression_steps": 400, "steps": 1600, "generations": 2}
     run = Trainer(sequence()[0], Recipe.from_dict({**HELD, **settings}), tmp_path / "held")
-    rates = []
-    for run.step in range(run.steps):
-        rates.append(run._rate_factor())
+    rates = [run.schedule.rate_factor(step) for step in range(run.steps)]
     assert rates[:2000] == rates[2000:] and rates[0] < 0.01
     assert set(rates[200:1001]) == {1.0} and rates[1500] == pytest.approx(0.5) and rates[1999] < 1e-5
     run = Trainer(sequence()[0], Recipe.from_dict({**HELD, **settings, "generations": 1, "hold": 0}), tmp_path)
-    for run.step, rate in ((300, 0.5 * (1 + np.cos(np.pi * 0.75))), (400, 0.005), (1200, 0.5)):
-        assert run._rate_factor() == pytest.approx(rate)
+    for step, rate in ((300, 0.5 * (1 + np.cos(np.pi * 0.75))), (400, 0.005), (1200, 0.5)):
+        assert run.schedule.rate_factor(step) == pytest.approx(rate)
 
 
 def test_a_start_is_of_the_chirality_that_the_layout_asks_for(tmp_path, monkeypatch):
@@ -183,7 +186,7 @@ def test_a_start_is_of_the_chirality_that_the_layout_asks_for(tmp_path, monkeypa
     true = true_start(data, camera, R)
     monkeypatch.setattr(starting, "search", lambda *given: start)
     kept = []
-    for start in (true, starting.mirrored(true)):
+    for start in (true, true.mirrored()):
         run = Trainer(data, Recipe.from_dict(STARTED), tmp_path / str(len(kept)))
         run.prepare()
         kept.append(run.start)
@@ -194,7 +197,7 @@ def test_a_start_is_of_the_chirality_that_the_layout_asks_for(tmp_path, monkeypa
 
 def test_a_mirrored_start_explains_the_same_views():
     start = true_start(*sequence())
-    other = starting.mirrored(start)
+    other = start.mirrored()
     a, b = (s.rotations @ s.shapes for s in (start, other))
     np.testing.assert_allclose(a * [[1], [1], [-1]], b, atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(other.rotations), 1, rtol=1e-5)
@@ -203,8 +206,8 @@ def test_a_mirrored_start_explains_the_same_views():
 def lesson_of(data, start, scale="unit", calibrated=False):
     """What a start of these frames teaches."""
     W, visible, facing = torch.from_numpy(data.W), torch.from_numpy(data.visible), torch.ones(len(data.W), 1, 1)
-    views = Views.of(W, visible, facing, calibrated, data.image_unit if scale == "unit" else None)
-    return starting.Lesson.of(start, views, data.layout, scale)
+    views = NormalisedViews.of(W, visible, facing, calibrated, data.image_unit if scale == "unit" else None)
+    return Lesson.of(start, views, data.layout, scale)
 
 
 def test_a_shape_seen_by_its_own_camera_is_its_view():
@@ -224,7 +227,7 @@ def test_where_there_is_perspective_a_shape_is_seen_with_it():
     unit = np.sqrt(((rays - rays.mean(2, keepdims=True)) ** 2).mean((1, 2)))[
         :, None, None
     ]  # of W where starts are found
-    start = starting.Start(np.arange(40), (np.swapaxes(R, 1, 2) @ S / distance / unit).astype(np.float32), R, -1, 2.5)
+    start = Start(np.arange(40), (np.swapaxes(R, 1, 2) @ S / distance / unit).astype(np.float32), R, -1, 2.5)
     lesson, own = lesson_of(seen, start, "free", calibrated=True), torch.arange(40)
     W = lesson.seen_by(own, lesson.shapes_of(own, None)).numpy()
     parallel = S[:, :2] / distance
@@ -238,7 +241,7 @@ def test_views_of_held_solutions_have_the_detectors_errors(tmp_path, searches):
     detected[:, :, 0] = np.nan
     run = Trainer(replace(data, detected=detected), Recipe.from_dict(HELD), tmp_path)
     W = torch.rand(40, 2, 9)
-    seen, visible = run._detected_as(torch.arange(40), W)
+    seen, visible = run._sampler.detected_as(torch.arange(40), W)
     reported = ~visible[:, 0]
     assert 20 < reported.sum() < 36
     torch.testing.assert_close(seen[~reported], W[~reported])
@@ -246,7 +249,7 @@ def test_views_of_held_solutions_have_the_detectors_errors(tmp_path, searches):
     assert visible[:, 1:].all()
     np.testing.assert_array_equal(run.views(torch.arange(40)).visible.numpy(), data.visible)
     run.prepare()
-    views, *_ = run._batch(trainer.HELD)
+    views = run._sampler.draw(run._lesson).views
     assert views.visible[:, 1:].all() and not views.visible.all()
 
 
@@ -254,11 +257,11 @@ def test_starts_are_searched_for_where_perspective_is_least(tmp_path, monkeypatc
     data, camera, R = sequence(frames=30)
     W = data.W * np.linspace(0.001, 0.002, 30)[:, None, None].astype(np.float32)[::-1]
     far = ((W - W.mean(2, keepdims=True)) ** 2).sum((1, 2)).argsort()
-    found = starting.Start(np.array([3, 5]), np.zeros((2, 3, 9), np.float32), R[:2], 0.0, 1.0)
+    found = Start(np.array([3, 5]), np.zeros((2, 3, 9), np.float32), R[:2], 0.0, 1.0)
     asked = []
     monkeypatch.setattr(starting, "search", lambda kind, W, *rest: asked.append(W) or found)
     run = Trainer(replace(data, W=W, calibrated=True), Recipe.from_dict({**HELD, "scale": "free"}), tmp_path)
-    start = run._search(None)
+    start = starting.find_start(run.frames, run.recipe, None)
     assert len(asked[0]) == 10
     np.testing.assert_array_equal(start.rows, far[[3, 5]])
 
@@ -278,16 +281,14 @@ def test_a_symmetric_object_mirrored_is_itself():
     S = np.random.default_rng(0).standard_normal((3, 17))
     S = S + np.diag([-1, 1, 1]) @ S[:, COCO.mirror]
     S = Rotation.random(random_state=0).as_matrix() @ (S - S.mean(1, keepdims=True))
-    start = starting.Start(
-        np.arange(4), np.repeat(S[None], 4, 0).astype(np.float32), np.repeat(np.eye(3)[None], 4, 0), 0, 0
-    )
+    start = Start(np.arange(4), np.repeat(S[None], 4, 0).astype(np.float32), np.repeat(np.eye(3)[None], 4, 0), 0, 0)
     lesson = lesson_of(sequence(frames=4, layout=COCO)[0], start)
     plain, mirrored = (lesson.shapes_of(torch.arange(4), flag.expand(4, 1, 1)) for flag in torch.tensor([False, True]))
     torch.testing.assert_close(plain, mirrored, rtol=0, atol=1e-5)
 
 
 def test_turned_views_are_rotations_or_their_mirror_images():
-    turn, facing = trainer.turned_views(torch.linspace(0, 6, 8), torch.arange(8) % 2 == 0)
+    turn, facing = turned_views(torch.linspace(0, 6, 8), torch.arange(8) % 2 == 0)
     torch.testing.assert_close(turn @ turn.mT, torch.eye(2).expand(8, 2, 2), rtol=0, atol=1e-6)
     torch.testing.assert_close(torch.linalg.det(turn), facing[:, 0, 0])
     assert facing[:, 0, 0].tolist() == [-1, 1] * 4
@@ -342,27 +343,6 @@ def test_the_auto_decoder_trains_no_shape_encoder(tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(before, run.networks.shape_encoder.parameters()))
 
 
-def test_patience_compares_windows_of_steps(tmp_path):
-    run = Trainer(sequence()[0], Recipe.from_dict({**FREE, "patience": 3}), tmp_path)
-    settled = [run._settled(loss) for loss in (9, 5, 4, 1, 7, 9, 5, 5, 6.9, 5.63, 5.63, 5.63)]
-    assert [i for i, stop in enumerate(settled) if stop] == [11]  # means 6, 5.667, 5.633, 5.630
-
-
-def test_a_settled_run_stops_and_stays_so(tmp_path):
-    recipe = Recipe.from_dict(
-        {**FREE, "steps": 50, "batch": 0, "patience": 5, "learning_rate": 1e-12, "code_learning_rate": 1e-12}
-    )
-    run = through(Trainer(sequence()[0], recipe, tmp_path))
-    assert run.stopped and run.step == 10
-    again = Trainer(sequence()[0], recipe, tmp_path)
-    assert again.resume() and through(again).step == 10
-    until(Trainer(sequence()[0], recipe, tmp_path / "parts"), 7)
-    parts = Trainer(sequence()[0], recipe, tmp_path / "parts")
-    assert parts.resume() and through(parts).step == 10
-    with open(tmp_path / "log.csv") as file:
-        assert [row["step"] for row in csv.DictReader(file)] == ["10"]
-
-
 def test_ctrl_c_waits_for_the_step(tmp_path, monkeypatch):
     """It comes between the weights of a step, and the run continues as if it had not."""
     data, recipe = sequence()[0], Recipe.from_dict({**FREE, "steps": 6})
@@ -403,7 +383,6 @@ BAD = {
     "solver": ({"solver": "fast"}, "solver must be one of"),
     "streams": ({"streams": 2}, "streams"),
     "restarts": ({"restarts": 0}, "restarts"),
-    "patience": ({"patience": -1}, "patience"),
     "nothing to do": ({"steps": 0}, "nothing is trained"),
     "start unused": ({"start": "linear"}, "regression_steps"),
     "generations without hold": ({"generations": 2}, "give the recipe hold"),
@@ -433,7 +412,7 @@ def test_the_papers_recipe_is_the_papers():
     paper = Recipe.load("paper")
     assert paper.hidden[::-1] == (256, 128, 64, 32, 16) and paper.bottleneck == 8
     assert (paper.code_weight, paper.decay_weight, paper.solver, paper.start) == (0.01, 1e-4, "algebraic", "random")
-    beyond = (paper.handedness_weight, paper.bone_weight, paper.nuclear_weight, paper.hide, paper.roll)
+    beyond = (paper.handedness_weight, paper.bone_weight, paper.nuclear_weight, paper.roll)
     assert not any(beyond) and not paper.mirror_view and not paper.mirror_object
 
 

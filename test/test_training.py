@@ -15,16 +15,16 @@ from scipy.spatial.transform import Rotation
 from tiny_data import FROM_RANDOM_WEIGHTS
 
 from msg_adapters.outputs import keypoints_cloud
+from paul_ros.cli import train as cli
 from paul_ros.errors import BagError, ModelError
 from paul_ros.layout import load_layout
 from paul_ros.model_file import load_model
 from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records
 from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import open_stream
-from training import command as cli
-from training.data import load_training_data
 from training.errors import DataError, RecipeError, TrainingError
 from training.export import mean_shape, metres_per_unit
+from training.loading import load_training_data
 from training.recipe import Recipe, recipe_names
 from training.trainer import Trainer
 
@@ -92,7 +92,7 @@ def test_only_2d_reaches_the_trainer(data_file, tmp_path, monkeypatch):
 
 def test_interrupted_and_continued_equals_uninterrupted(data_file, tmp_path):
     data = load_training_data(data_file, COCO)
-    recipe = Recipe.from_dict({"steps": 10, "width": 16, "batch": 8, "hide": 0.3, "mirror_object": True})
+    recipe = Recipe.from_dict({"steps": 10, "width": 16, "batch": 8, "mirror_object": True})
     whole = Trainer(data, recipe, tmp_path / "whole")
     for _ in whole.run():
         pass
@@ -213,26 +213,18 @@ def test_frames_with_too_few_points_are_left_out_and_counted(tmp_path):
         ("nonsense=1", "unknown"),
         ("batch", "key=value"),
         ("width=-4", "positive"),
-        ("hide=1.0", "hide"),
-        ("fade=[1]", "fade"),
-        ("fade=[a, b]", "fade"),
+        ("hide=0.3", "unknown recipe setting hide; known are bottleneck"),
+        ("seed=-1", "seed must be at least 0"),
+        ("seed=1e12", "seed must be at most 4294967295"),
+        ("batch=1e9", "batch must be at most"),
+        ("restarts=1e9", "restarts must be at most"),
+        ("stature=1e7", "stature must be 0, or metres"),
+        ("views=5", "views must be settings as key: value"),
     ],
 )
 def test_bad_recipes_are_refused(override, message):
     with pytest.raises(RecipeError, match=message):
         Recipe.load("default", [override])
-
-
-@pytest.mark.parametrize(
-    "fade, strengths", [((0, 0), [0, 0, 0, 0]), ((0.5, 0.5), [1, 1, 0, 0]), ((0, 1), [1, 0.75, 0.5, 0.25])]
-)
-def test_view_augmentation_fades_as_the_recipe_says(data_file, tmp_path, fade, strengths):
-    recipe = Recipe.from_dict({"steps": 4, "width": 16, "batch": 8, "fade": fade})
-    trainer = Trainer(load_training_data(data_file, COCO), recipe, tmp_path / "run")
-    found = []
-    for trainer.step in range(4):
-        found.append(trainer._strength())
-    assert found == strengths
 
 
 def test_the_data_is_never_overwritten_by_the_model(data_file):
@@ -245,9 +237,10 @@ def test_the_data_is_never_overwritten_by_the_model(data_file):
 
 
 @pytest.mark.parametrize("override", ["width=5000", "blocks=101", "bottleneck=20000"])
-def test_models_that_could_not_be_loaded_are_refused_before_training(data_file, tmp_path, override):
+@pytest.mark.parametrize("option", ["-o", "--shapes"])
+def test_networks_too_large_for_a_model_file_are_refused_before_training(data_file, tmp_path, override, option):
     with pytest.raises(ModelError, match="could not be loaded"):
-        train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", override)
+        train(data_file, option, tmp_path / "m.npz", *SMALL, "--set", override)
     assert not list((tmp_path / "m.run").glob("*"))
 
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from paul_ros.layout import anonymous_layout
 from training.data import TrainingData
-from training.start.kept_start import Start
+from training.start.start import Start
 
 POINTS = 9
 

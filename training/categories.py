@@ -1,38 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several files as one: recordings of one layout follow each other, categories of objects lie side by side.
 
-One model of several categories, as in C3DPO (Novotny et al., ICCV 2019) and PAUL on Pascal3D+: the points of all
-categories side by side in one layout, of which a frame shows those of its own category; the others are hidden, and
-cost nothing.  Which category a frame is of, the networks see from the visibility mask.
+One model may cover several categories, as in C3DPO (Novotny et al., ICCV 2019) and PAUL on Pascal3D+. The points of all
+categories lie side by side in one layout. A frame shows the points of its own category; the others are hidden, and cost
+nothing. The networks recognise the category by the visibility mask.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from paul_ros.layout import Layout
-from paul_ros.stream.parameters import DEFAULTS
-from training.data import TrainingData, load_training_data
+from training.data import DEFAULT_LAYOUT, TrainingData
 from training.errors import DataError
-from training.judge.truth import Sequence
+from training.loading import MIN_CONFIDENCE, load_training_data
+
+if TYPE_CHECKING:
+    from training.judge import truth as judge
 
 
 def load_files(
-    paths: list[str | Path],
+    paths: Sequence[str | Path],
     layout: Layout | None = None,
     topic: str | None = None,
-    min_confidence: float = DEFAULTS["min_confidence"],
+    min_confidence: float = MIN_CONFIDENCE,
 ) -> TrainingData:
-    """Read one file to train on, or several: each as ``load_training_data`` does.
+    """Load one or several files, each as ``load_training_data`` does.
 
-    With a layout given, or of 17 points all of them, several files are recordings of the same points.  Else each is a
-    category of its own, named by its file.
+    Several files are recordings of the same points if a layout is given, or if all have the 17 points of coco17. Else
+    each file is a category of its own, named by the file.
 
     Raises:
-        DataError, BagError: as ``load_training_data``; or files that cannot be trained on together.
+        DataError, BagError: see ``load_training_data``; or files that cannot be trained on together.
     """
     parts = [load_training_data(path, layout, topic, min_confidence) for path in paths]
     if len({part.calibrated for part in parts}) > 1:
@@ -43,7 +47,7 @@ def load_files(
         return parts[0]
     if any(part.detected is not None for part in parts):
         raise DataError("`detected` is for a file that is trained on alone: join the arrays in one npz")
-    if layout is not None or all(part.layout.name == "coco17" for part in parts):
+    if layout is not None or all(part.layout.name == DEFAULT_LAYOUT for part in parts):
         return one_after_another(parts)
     names = [Path(path).stem for path in paths]
     if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -60,17 +64,17 @@ def load_files(
 
 
 def one_after_another(parts: list[TrainingData]) -> TrainingData:
-    """All frames of data of one layout."""
+    """Join the frames of recordings of one layout."""
     W = np.concatenate([part.W for part in parts])
     visible = np.concatenate([part.visible for part in parts])
     return _joined(parts, W, visible, parts[0].layout)
 
 
 def side_by_side(names: list[str], parts: list[TrainingData]) -> TrainingData:
-    """All frames of data of several categories, in the joint layout of all their points: the others' are hidden."""
+    """Join the frames of several categories in the joint layout of all their points; foreign points are hidden."""
     layout = joint_layout(names, [part.layout for part in parts])
-    frames, points = sum(len(part.W) for part in parts), len(layout.names)
-    W, visible = np.zeros((frames, 2, points), np.float32), np.zeros((frames, points), bool)
+    total, points = sum(len(part.W) for part in parts), len(layout.names)
+    W, visible = np.zeros((total, 2, points), np.float32), np.zeros((total, points), bool)
     row = 0
     for part, (first, *_, last) in zip(parts, layout.categories.values()):
         frames = slice(row, row + len(part.W))
@@ -80,12 +84,16 @@ def side_by_side(names: list[str], parts: list[TrainingData]) -> TrainingData:
 
 
 def joint_layout(names: list[str], layouts: list[Layout]) -> Layout:
-    """The points of several layouts side by side, category by category, each named ``category.point``.
+    """Return the points of several layouts side by side, each named ``category.point``.
+
+    Args:
+        names: of the categories.
+        layouts: of the categories.
 
     Raises:
         LayoutError: more points than a layout can have.
     """
-    joint = {"names": [], "edges": [], "left_right": [], "handedness": []}
+    joint: dict[str, list] = {"names": [], "edges": [], "left_right": [], "handedness": []}
     categories = {}
     for category, layout in zip(names, layouts):
         own = _prefixed({key: layout.to_dict()[key] for key in joint}, f"{category}.")
@@ -95,15 +103,15 @@ def joint_layout(names: list[str], layouts: list[Layout]) -> Layout:
     return Layout.from_dict({"name": "+".join(names), **joint, "root": joint["names"], "categories": categories})
 
 
-def among_categories(truth: Sequence, layout: Layout) -> Sequence:
-    """A file of one category, named like it, in the joint layout: the others' points are hidden, their truth unknown.
+def among_categories(truth: judge.Sequence, layout: Layout) -> judge.Sequence:
+    """Return a sequence of one category, which has the category's name, in the joint layout.
 
-    Any other file as it is.
+    Points of other categories are hidden, and their truth is unknown. Any other sequence is returned as it is.
     """
-    points = layout.categories.get(truth.name, ())
+    points = list(layout.categories.get(truth.name, ()))
     if truth.W.shape[2] != len(points):
         return truth
-    points, frames, every = list(points), len(truth.W), len(layout.names)
+    frames, every = len(truth.W), len(layout.names)
     W, visible = np.zeros((frames, 2, every)), np.zeros((frames, every), bool)
     S = np.full((frames, 3, every), np.nan)
     W[:, :, points], visible[:, points], S[:, :, points] = truth.W, truth.visible, truth.S
@@ -111,8 +119,8 @@ def among_categories(truth: Sequence, layout: Layout) -> Sequence:
     return replace(truth, W=W, visible=visible, S=S, edges=edges)
 
 
-def _prefixed(item: object, prefix: str) -> object:
-    """A layout's lists with every point's name prefixed."""
+def _prefixed(item: Any, prefix: str) -> Any:
+    """Return a layout's lists with a prefix before every point's name."""
     if isinstance(item, str):
         return prefix + item
     if isinstance(item, dict):

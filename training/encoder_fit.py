@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""After free codes are trained: a 2D encoder h that gives them, so that the model also lifts what it never saw."""
+"""Fit a 2D encoder h to trained free codes, so that the model also lifts unseen frames."""
 
 from __future__ import annotations
 
@@ -7,19 +7,28 @@ import math
 
 import torch
 
-from training.start.kept_start import Progress
-from training.trainer import Trainer, turned_views
+from training.progress import Progress, ignore_progress
+from training.trainer import Trainer
+from training.views import turned_views
 
 STEPS = 3000
 _BATCH = 128
 _LEARNING_RATE = 1e-3
 
 
-def fit_encoder(trainer: Trainer, steps: int = STEPS, progress: Progress = lambda done: None) -> float:
-    """Train h by regression to the run's free codes; returns the mean distance that is left, as a share of the size.
+def fit_encoder(trainer: Trainer, steps: int = STEPS, progress: Progress = ignore_progress) -> float:
+    """Train h by regression to the run's free codes.
 
-    Distances are of shapes, |f_d(h(W)) - f_d(phi)| over |f_d(phi)|, for codes have no scale of their own. Views are
-    turned in their plane by any angle and half of them mirrored: under an orthographic camera the code stays the same.
+    Codes have no scale of their own, so distances are between shapes: |f_d(h(W)) - f_d(phi)| over |f_d(phi)|. Views are
+    turned in their plane by any angle, and half of them mirrored: the code of an orthographic view stays the same.
+
+    Args:
+        trainer: a finished run.
+        steps: of Adam.
+        progress: called with the share of the work that is done.
+
+    Returns:
+        The mean distance that is left.
     """
     networks, device = trainer.networks, trainer.device
     generator = torch.Generator().manual_seed(trainer.recipe.seed)

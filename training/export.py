@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a finished run to the model file that the robot loads."""
+"""Export a finished run to the model file that the robot loads."""
 
 from __future__ import annotations
 
@@ -13,24 +13,32 @@ import torch
 import paul_ros
 from paul_ros.layout import Layout
 from paul_ros.metrics import procrustes
-from paul_ros.model_file import save_model
+from paul_ros.model import save_model
+from training.chirality import rule_share, same_side_share
+from training.data import TrainingData
+from training.networks import Paul
 from training.objective import fit
 from training.recipe import Recipe
-from training.trainer import Trainer, predict_shapes, rule_share
+from training.trainer import Trainer
+from training.views import NormalisedViews
 
 _SHAPES, _COORDINATES = 4096, 2**24
-"""Shapes of training frames that the mean is taken of: so many, or as many as have so many coordinates."""
+"""Largest number of training shapes whose mean is taken, and of their coordinates."""
 
 _BATCH = 1024
 _MEAN_ROUNDS = 10
-_CLEAR = 0.95  # share of shapes on one side of the handedness rules that settles the chirality
+_CLEAR = 0.95
+"""Share of shapes on the right side of the handedness rules above which the chirality is known."""
 
 
 def export_model(trainer: Trainer, loss: float, path: Path, command: str) -> dict:
-    """Write encoder, decoder and mean shape; returns the header.
+    """Write encoder, decoder and mean shape; return the header.
 
     Args:
-        loss: the run's final one, see ``Reconstruction``.
+        trainer: the finished run.
+        loss: its final loss, see ``Reconstruction``.
+        path: of the model file.
+        command: as typed, for provenance.
 
     Raises:
         ModelError: the weights do not make a model (NaN, say).
@@ -67,7 +75,7 @@ def export_model(trainer: Trainer, loss: float, path: Path, command: str) -> dic
 
 
 def architecture(recipe: Recipe) -> dict:
-    """The part of the header that says how the networks are built."""
+    """Return the part of the header that describes the networks."""
     return {
         "bottleneck": recipe.bottleneck,
         "architecture": {
@@ -83,7 +91,7 @@ def architecture(recipe: Recipe) -> dict:
 
 
 def _scale(trainer: Trainer) -> dict:
-    """The part of the header that says what sizes mean: of the image points, and of the shapes."""
+    """Return the part of the header that defines the units of image points and shapes."""
     if trainer.recipe.scale == "unit":
         return {
             "scale": "unit",
@@ -103,7 +111,7 @@ def _scale(trainer: Trainer) -> dict:
 
 
 def _weights(trainer: Trainer) -> dict[str, np.ndarray]:
-    """What runs on the robot: h and f_d, under the names that ``paul_ros.model`` gives them."""
+    """Return the weights that the robot needs, of h and f_d, under the names of ``paul_ros.model``."""
     return {
         name: value.cpu().numpy()
         for name, value in trainer.networks.state_dict().items()
@@ -112,11 +120,10 @@ def _weights(trainer: Trainer) -> dict[str, np.ndarray]:
 
 
 def _chirality(shapes: np.ndarray, mean: np.ndarray, layout: Layout, weight: float) -> dict:
-    """Which of the two mirror images the model's shapes are, and how that is known.
+    """Return the part of the header about the mirror image: whether it is known, and from where.
 
-    Without a rule to tell them apart, one sign for the whole model is left open by any number of orthographic views;
-    how far the shapes agree on it among themselves is measured by their mean shape.  A rule speaks for its own category
-    only.
+    Without a handedness rule any number of orthographic views leaves one sign for the whole model open. The mean shape
+    then measures how far the shapes agree among themselves. A rule holds for its own category only.
     """
     share = rule_share(shapes, layout)
     if share is None:
@@ -136,17 +143,8 @@ def _chirality(shapes: np.ndarray, mean: np.ndarray, layout: Layout, weight: flo
     }
 
 
-def same_side_share(shapes: np.ndarray, mean: np.ndarray) -> float:
-    """Share of shapes (F,3,P) that turn onto the mean (3,P) better than their mirror images do.
-
-    With the singular values a >= b >= c of S mean^T, S fits by a + b +- c and its mirror image by a + b -+ c, with the
-    sign of the determinant.
-    """
-    return float((np.linalg.det(shapes @ mean.T) > 0).mean())
-
-
 def mean_shape(shapes: np.ndarray) -> np.ndarray:
-    """Generalised Procrustes mean (3,P) of canonical shapes (F,3,P): rotations only, sizes as they are."""
+    """Return the generalised Procrustes mean (3,P) of canonical shapes (F,3,P), with rotations and without scales."""
     points = shapes.transpose(0, 2, 1)
     mean = points[0]
     for _ in range(_MEAN_ROUNDS):
@@ -156,10 +154,22 @@ def mean_shape(shapes: np.ndarray) -> np.ndarray:
 
 
 @torch.no_grad()
-def misfit(trainer: Trainer) -> float:
-    """Standard deviation of x and of y of visible training points about where the networks put them, in model units.
+def predict_shapes(networks: Paul, data: TrainingData, limit: int) -> np.ndarray:
+    """Return canonical shapes (F,3,P) of up to ``limit`` evenly chosen training frames, from their 2D points by h."""
+    rows = np.linspace(0, len(data.W) - 1, min(limit, len(data.W))).astype(int)
+    device = next(networks.parameters()).device
+    W, visible = torch.from_numpy(data.W[rows]).to(device), torch.from_numpy(data.visible[rows]).to(device)
+    unit = None if networks.decoder.unit_size else data.image_unit
+    views = NormalisedViews.of(W, visible, torch.ones(len(rows), 1, 1, device=device), False, unit)
+    return networks.decoder(networks.encoder(views.W, visible)).double().cpu().numpy()
 
-    From the median distance, for some points are misdetected: with Gaussian errors it is 1.177 standard deviations.
+
+@torch.no_grad()
+def misfit(trainer: Trainer) -> float:
+    """Return the standard deviation, in model units, of visible training points from the networks' points, per axis.
+
+    It is computed from the median distance, because some points are misdetected. For Gaussian errors the median is
+    1.177 standard deviations.
     """
     distances = []
     frames = len(trainer.data.W)
@@ -172,7 +182,12 @@ def misfit(trainer: Trainer) -> float:
 
 
 def metres_per_unit(shapes: np.ndarray, layout: Layout, known_lengths: tuple) -> float | None:
-    """Metres per model unit from lengths known in advance: their sum over the sum of their median model lengths.
+    """Return metres per model unit: the sum of known lengths over the sum of their median lengths in the model.
+
+    Args:
+        shapes: (F,3,P) canonical shapes, model units.
+        layout: of the points.
+        known_lengths: (point, point, metres) each; without any the result is None.
 
     Raises:
         KeyError: a name that is no point of the layout.

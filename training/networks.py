@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The networks of the paper: 2D encoder h (or free codes), shape decoder f_d, shape encoder f_e.
 
-Parameter names are those of the model file, so that the trained encoder and decoder are exported as they are.
+Parameters have the names of the model file, so that export copies encoder and decoder unchanged.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,18 +19,18 @@ from paul_ros.model_file import dictionary_sizes
 from training.recipe import Recipe
 
 _FREE_CODE_SIZE = 0.1
-"""Standard deviation of free codes at the start: a tenth or ten times of it trained worse."""
+"""Standard deviation of the initial free codes; values ten times smaller or larger trained worse."""
 
 
 class _Layers(torch.autograd.Function):
-    """Linear layers with an ELU between any two: x (N,inputs) and each layer's weight and bias to (N,outputs).
+    """Linear layers with an ELU between them: x (N,inputs), weights and biases to (N,outputs).
 
-    One function of autograd's, for batches so small that its bookkeeping would cost as much as the layers; and with an
-    ELU made of exp, which is several times faster than expm1 and as good: the slope is taken from the result.
+    All layers are one function of autograd: in small batches its bookkeeping would cost as much as the layers. The ELU
+    uses exp, which is several times faster than expm1 and as accurate, as the slope comes from the result.
     """
 
     @staticmethod
-    def forward(ctx: torch.autograd.function.FunctionCtx, x: Tensor, *parameters: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor, *parameters: Tensor) -> Tensor:
         weights, biases = parameters[::2], parameters[1::2]
         inputs = [x]
         for weight, bias in zip(weights[:-1], biases[:-1]):
@@ -41,7 +42,7 @@ class _Layers(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: torch.autograd.function.FunctionCtx, gradient: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
         count = len(ctx.saved_tensors) // 2
         inputs, weights = ctx.saved_tensors[:count], ctx.saved_tensors[count:]
         found = []
@@ -72,8 +73,10 @@ class Encoder(nn.Module, ABC):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K).
 
     Args:
-        axes: (2,P) what every view is brought upright by (``paul_ros.model.upright``); None: h sees views as they are.
+        axes: (2,P) by which views are turned upright (``paul_ros.model.upright``); None leaves them as they are.
     """
+
+    axes: Tensor | None
 
     def __init__(self, axes: Tensor | None) -> None:
         super().__init__()
@@ -84,13 +87,13 @@ class Encoder(nn.Module, ABC):
 
     @abstractmethod
     def code(self, W: Tensor, visible: Tensor) -> Tensor:
-        """h of views that are upright already."""
+        """Return codes (N,K) of views that are upright already."""
 
 
 class ResidualEncoder(Encoder):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by residual blocks.
 
-    Martinez et al. have 2 blocks; 6 of width 1024 are the depth of C3DPO (Novotny et al., ICCV 2019).
+    Martinez et al. use 2 blocks; C3DPO (Novotny et al., ICCV 2019) is as deep as 6 blocks of width 1024.
     """
 
     def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axes: Tensor | None = None) -> None:
@@ -109,18 +112,18 @@ class ResidualEncoder(Encoder):
 class ConvolutionalEncoder(Encoder):
     """h: normalised image points (N,2,P) and visibility (N,P) to codes (N,K), by block-sparse coding.
 
-    The encoder of Deep NRSfM (Kong and Lucey, ICCV 2019).  An orthographic view of S = sum_k c_k D_k by a camera R is
-    W = sum_k (c_k R) D_k: what a dictionary finds in a frame are blocks of 3 x 2 numbers, and a dictionary of
-    dictionaries acts on all six numbers of a block alike.  As there, each layer is one iteration of ISTA from zero: a
-    product with the transposed dictionary (a convolution, of kernel 3 x 1 and then 1 x 1) and a threshold for each
-    atom, a block soft threshold relaxed to a ReLU; atoms grow fewer towards the bottleneck, in equal steps; the code is
-    linear in the last blocks.
+    This is the encoder of Deep NRSfM (Kong and Lucey, ICCV 2019). An orthographic view of S = sum_k c_k D_k by a camera
+    R is W = sum_k (c_k R) D_k. A dictionary thus finds blocks of 3 x 2 numbers in a frame, and a dictionary of
+    dictionaries acts on all six numbers of a block alike. Each layer is one iteration of ISTA from zero. It multiplies
+    by the transposed dictionary, a convolution of kernel 3 x 1 in the first layer and 1 x 1 in later ones. Then it
+    applies a threshold for each atom, a block soft threshold relaxed to a ReLU. The number of atoms falls to the
+    bottleneck in equal steps. The code is linear in the last blocks.
 
-    Hidden points are masked as in Deep NRSfM++ (Wang et al., 3DV 2020): there D is centred on the visible points and
-    its hidden columns are left out, which for W centred on them, and zero where hidden, gives the same products.
+    Hidden points are masked as in Deep NRSfM++ (Wang et al., 3DV 2020), which centres D on the visible points and
+    leaves out its hidden columns. Here W is centred on the visible points and 0 where hidden: the products are equal.
 
-    Unlike there, the decoder does not share the dictionaries (f_d is PAUL's), the camera is not read off the blocks (it
-    is solved for), and the last layer is also told which points are visible.
+    Three things differ from Deep NRSfM. The decoder does not share the dictionaries, as f_d is PAUL's. The camera is
+    solved for, not read off the blocks. The last layer also gets the visibility mask.
     """
 
     def __init__(self, points: int, bottleneck: int, width: int, blocks: int, axes: Tensor | None = None) -> None:
@@ -148,7 +151,8 @@ ENCODERS = {RESIDUAL: ResidualEncoder, CONVOLUTIONAL: ConvolutionalEncoder}
 class ShapeDecoder(nn.ModuleList):
     """f_d: codes (N,K) to canonical shapes (N,3,P) in model units, centred on their mean.
 
-    ``unit_size``: shapes are of unit size (``to_unit_size``), as their scale is a camera's; else they keep their own.
+    Attributes:
+        unit_size: shapes have unit size (``to_unit_size``), as the camera has a scale; else they keep their own size.
     """
 
     def __init__(self, layout: Layout, bottleneck: int, hidden: tuple[int, ...], unit_size: bool) -> None:
@@ -173,10 +177,12 @@ class ShapeEncoder(nn.ModuleList):
 
 
 class Paul(nn.Module):
-    """The networks together.
+    """All networks of a run.
 
-    Codes come from h, or are free variables of the training frames (``free_codes``, None where h gives them).  h is
-    there in either case: the model file needs one.
+    Codes come from h, or are free variables of the training frames. h exists in both cases: the model file needs it.
+
+    Attributes:
+        free_codes: of the frames; None if h gives the codes.
     """
 
     def __init__(
@@ -191,17 +197,22 @@ class Paul(nn.Module):
         self.free_codes = free_codes
 
     def codes(self, W: Tensor, visible: Tensor, rows: Tensor) -> Tensor:
-        """Codes (N,K) of normalised image points W (N,2,P) with visibility (N,P); rows (N,) are their frame numbers.
+        """Return codes (N,K): h(W, visible), or free codes by frame number.
 
-        Free codes are looked up by frame number; else they are h(W, visible) and the numbers are not looked at.
+        Args:
+            W: (N,2,P) normalised image points.
+            visible: (N,P) bool.
+            rows: (N,) frame numbers.
         """
         return self.encoder(W, visible) if self.free_codes is None else self.free_codes(rows)
 
 
 def build_networks(layout: Layout, recipe: Recipe, frames: int, axes: Tensor | None = None) -> Paul:
-    """The recipe's networks for a layout, with fresh weights from torch's default generator.
+    """Return the recipe's networks for a layout, with fresh weights from torch's default generator.
 
     Args:
+        layout: of the points.
+        recipe: of the run.
         frames: number of training frames, for free codes.
         axes: (2,P) of ``Encoder``.
     """
@@ -217,9 +228,9 @@ def build_networks(layout: Layout, recipe: Recipe, frames: int, axes: Tensor | N
 
 
 def main_axes(W: Tensor, layout: Layout) -> Tensor:
-    """(2,P) weights of the points whose sums in views (F,2,P) are longest: the first two principal directions.
+    """Return (2,P) weights of points, the first two principal directions of views (F,2,P): their sums are longest.
 
-    Of each category's points among themselves: else views of one category could be all but blind to the others' axes.
+    Each category has directions of its own. Joint ones could nearly vanish in the views of one category.
     """
     axes = W.new_zeros(2, W.shape[2])
     for part in layout.parts:
@@ -252,7 +263,7 @@ def to_unit_size(S: Tensor, layout: Layout) -> Tensor:
 
 
 def _size(S: Tensor, own: Tensor, part: Part) -> Tensor:
-    """Sizes (N,1,1) of one part of shapes (N,3,P), by its edges or by its own points (N,3,p)."""
+    """Return sizes (N,1,1) of one part of shapes (N,3,P), from its edges or else from its own points (N,3,p)."""
     if part.edges:
         size = _lengths(S, part.edges).mean(1)
     else:
@@ -265,13 +276,13 @@ def _split(S: Tensor, layout: Layout) -> list[Tensor]:
 
 
 def _joined(parts: list[Tensor], layout: Layout) -> Tensor:
-    """The inverse of _split."""
+    """Join parts of shapes; the inverse of ``_split``."""
     order = torch.tensor([point for part in layout.parts for point in part.points], device=parts[0].device)
     return torch.cat(parts, dim=2)[:, :, order.argsort()]
 
 
 def edge_lengths(S: Tensor, layout: Layout) -> Tensor:
-    """Lengths (N,E) of the layout's edges in shapes (N,3,P)."""
+    """Return lengths (N,E) of the layout's edges in shapes (N,3,P)."""
     return _lengths(S, layout.edges)
 
 

@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training objective, term by term as in the paper (Wang and Lucey, CVPR 2021; equation numbers are its).
+"""The training objective, term by term as in the paper (Wang and Lucey, CVPR 2021), with its equation numbers.
 
-A code phi is decoded twice, by f_d(phi) and by f_d(f_e(f_d(phi))).  Equation 7, as the bilevel problem of equation 8:
+A code phi is decoded twice, by f_d(phi) and by f_d(f_e(f_d(phi))). Equation 7, as the bilevel problem of equation 8:
 
     min over networks: sum over frames of  min over R, z:  L_AE + L_AD + L_reg
     L_AE = |f_d f_e f_d(phi) - R^T [W; z]|_F,   L_AD = |f_d(phi) - R^T [W; z]|_F                      (6, 7)
     L_reg = 0.01 |phi|^2 + 1e-4 |theta_d|^2                                                           (12)
 
-The norms are unsquared and not divided by the number of points; sums over frames are means here.  The lower level, R
-and z, is solved by ``solver.py``: exactly, with its implicit gradients, or as the paper does (9, 10).
+The norms are unsquared and not divided by the number of points; sums over frames are means here. ``solver.py`` solves
+the lower level, R and z: exactly, with its implicit gradients, or as the paper does (9, 10).
 
-**Hidden points** (section 4.3 and the supplement).  W is centred on its v visible points, so shapes have to be as well:
+**Hidden points** (section 4.3 and the supplement). W is centred on its v visible points, so shapes are centred as well:
 
     S~ = S - (1/v) S M 1 1^T        M = diag(visible)                                                 (11, 13)
 
-The printed equation 11, S + S (I - M) 1 1^T, lacks the 1/v: for a shape of zero mean S (I - M) 1 = -S M 1, so that
-with 1/v it is the line above, the shape less the mean of its visible points, and without it projections of S~ are not
-centred where W is.  The unknown part of the camera-frame shape is free (14): z of every point, x and y of hidden ones;
-the printed equation 14 writes 0 for the depth of visible points, where equation 4 has it free.  The best free
-values are the mean of both streams (10), so a hidden point costs what its two streams differ by (15).
+The printed equation 11, S + S (I - M) 1 1^T, lacks the 1/v. For a shape of zero mean S (I - M) 1 = -S M 1. With 1/v
+it is thus the line above, the shape minus the mean of its visible points. Without 1/v projections of S~ and W have
+different centres. The unknown part of the camera-frame shape is free (14): z of every point, x and y of hidden ones.
+The printed equation 14 has 0 for the depth of visible points, which equation 4 leaves free. The best free values are
+the mean of both streams (10), so a hidden point costs the difference of its two streams (15).
 
-Beyond the paper, by weights of the recipe: a free scale of every frame, handedness, bones and perspective; and the
-nuclear norm of its baseline "ADL + low rank".
+Terms beyond the paper have weights in the recipe: handedness and bones; and the nuclear norm of the paper's baseline
+"ADL + low rank". A free scale of every frame and perspective are settings as well.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ from training.distributed import WHOLE, Share
 from training.networks import Paul, edge_lengths
 from training.recipe import Recipe
 from training.solver import Camera, algebraic_camera, centre, solve_camera
+from training.views import NormalisedViews
 
 
 @dataclass(frozen=True)
 class Terms:
-    """The loss of a batch and its parts before they are weighted, each a scalar; 0 where a part has no weight."""
+    """The loss of a batch and its unweighted parts, each a scalar; a part without weight is 0."""
 
     loss: Tensor
     recon_ae: Tensor
@@ -53,59 +54,16 @@ class Terms:
 
 
 @dataclass(frozen=True)
-class Views:
-    """Image points of a batch as the networks see them, and how they lay in the image.
-
-    Attributes:
-        W: (N,2,P) centred on the mean of the visible points; 0 where hidden.  Of root mean square distance 1, or, where
-            all views have one scale, divided by one number.
-        visible: (N,P) bool.
-        centre, size: (N,2,1) and (N,1,1), ``size * W + centre`` are the image points before that.
-        facing: (N,1,1), 1, or -1 where a view was mirrored: it shows the object from behind, so near and far change.
-        calibrated: the image points are rays, (x/z, y/z) of a pinhole camera looking at the object.
-    """
-
-    W: Tensor
-    visible: Tensor
-    centre: Tensor
-    size: Tensor
-    facing: Tensor
-    calibrated: bool
-
-    @classmethod
-    def of(cls, image: Tensor, visible: Tensor, facing: Tensor, calibrated: bool, unit: float | None = None) -> Views:
-        """Normalise image points (N,2,P); the torch twin of ``paul_ros.model.normalise``.
-
-        Args:
-            unit: what all views are divided by, in units of the image; None: each by its own size.
-        """
-        seen = visible[:, None].to(image.dtype)
-        count = seen.sum(2, keepdim=True)
-        middle = (image * seen).sum(2, keepdim=True) / count
-        offset = (image - middle) * seen
-        if unit is None:
-            size = (offset.square().sum((1, 2), keepdim=True) / count).sqrt().clamp_min(1e-9)
-        else:
-            size = torch.full_like(count, unit)
-        return cls(offset / size, visible, middle, size, facing, calibrated)
-
-    def __getitem__(self, part: slice) -> Views:
-        """Some of the views."""
-        arrays = (self.W, self.visible, self.centre, self.size, self.facing)
-        return Views(*(array[part] for array in arrays), self.calibrated)
-
-
-@dataclass(frozen=True)
 class Fit:
-    """The lower level solved: what a batch's networks and best cameras make of its views.
+    """Solution of the lower level for a batch of views.
 
     Attributes:
         code: (N,K) phi.
         shape: (N,3,P) f_d(phi), canonical frame.
         camera: R and scale.
-        streams: (2,N,3,P) f_d f_e f_d(phi) and f_d(phi) in the camera frame, in units of W, centred on the visible
-            points; (1,N,3,P) where the decoder's stream is trained alone.
-        points: (N,3,P) S_cam of equations 4 and 14: observed where it is, else the mean of the streams.
+        streams: (2,N,3,P) f_d f_e f_d(phi) and f_d(phi), camera frame, units of W, centred on the visible points. If
+            the decoder's stream is trained alone, it is the only one, (1,N,3,P).
+        points: (N,3,P) S_cam of equations 4 and 14: observed coordinates, else the mean of the streams.
     """
 
     code: Tensor
@@ -115,8 +73,15 @@ class Fit:
     points: Tensor
 
 
-def fit(networks: Paul, recipe: Recipe, views: Views, rows: Tensor) -> Fit:
-    """Decode a batch and solve its cameras (equations 8-10); rows (N,) are the frames' numbers, for free codes."""
+def fit(networks: Paul, recipe: Recipe, views: NormalisedViews, rows: Tensor) -> Fit:
+    """Decode a batch and solve its cameras (equations 8-10).
+
+    Args:
+        networks: of the run.
+        recipe: of the run.
+        views: the batch.
+        rows: (N,) frame numbers, for free codes.
+    """
     W, visible = views.W, views.visible
     code = networks.codes(W, visible, rows)
     shape, streams = _decoded(networks, recipe, code)
@@ -126,14 +91,14 @@ def fit(networks: Paul, recipe: Recipe, views: Views, rows: Tensor) -> Fit:
         W = undo_perspective(views, camera.scale * camera.R[:, 2:] @ mean)
         camera = _camera(streams, W, visible, recipe)
     streams = camera.scale * camera.R @ centre(streams, visible)
-    free = streams.mean(0)  # z*, and the whole of every hidden point
+    free = streams.mean(0)  # z*, and all coordinates of hidden points
     known = visible[:, None] & torch.tensor([True, True, False], device=W.device)[:, None]
     points = torch.where(known, torch.cat([W, W[:, :1]], dim=1), free)
     return Fit(code, shape, camera, streams, points)
 
 
 def _decoded(networks: Paul, recipe: Recipe, code: Tensor) -> tuple[Tensor, Tensor]:
-    """f_d(phi) of codes (N,K), and the streams that the recipe trains (2,N,3,P) or (1,N,3,P), the former last."""
+    """Return f_d(phi) of codes (N,K), and the recipe's streams (2,N,3,P) or (1,N,3,P), of which it is the last."""
     shape = networks.decoder(code)
     if recipe.streams == "decoder":
         return shape, shape[None]
@@ -141,7 +106,7 @@ def _decoded(networks: Paul, recipe: Recipe, code: Tensor) -> tuple[Tensor, Tens
 
 
 def _camera(streams: Tensor, W: Tensor, visible: Tensor, recipe: Recipe) -> Camera:
-    """The lower level's cameras.  Exactly: OnP of the streams' mean; algebraically: least squares of them all (9)."""
+    """Return the lower level's cameras: by OnP of the streams' mean, or by least squares of all streams (9)."""
     if recipe.solver == "exact":
         return solve_camera(streams.mean(0), W, visible, recipe.scale)
     times = len(streams)
@@ -150,18 +115,24 @@ def _camera(streams: Tensor, W: Tensor, visible: Tensor, recipe: Recipe) -> Came
 
 
 def paul_terms(
-    networks: Paul, layout: Layout, recipe: Recipe, views: Views, rows: Tensor, share: Share = WHOLE
+    networks: Paul, layout: Layout, recipe: Recipe, views: NormalisedViews, rows: Tensor, share: Share = WHOLE
 ) -> Terms:
-    """Evaluate the objective on a batch, or on this process's share of it: terms are always those of the batch."""
+    """Evaluate the objective on this process's share of a batch; the terms are those of the whole batch."""
     found = fit(networks, recipe, views, rows)
     distances = _distances(found.streams, found.points, own_points(views.visible, layout))
     return _terms(networks, layout, recipe, found.code, found.shape, distances, share)
 
 
 def regression_terms(
-    networks: Paul, layout: Layout, recipe: Recipe, views: Views, rows: Tensor, S: Tensor, share: Share = WHOLE
+    networks: Paul,
+    layout: Layout,
+    recipe: Recipe,
+    views: NormalisedViews,
+    rows: Tensor,
+    S: Tensor,
+    share: Share = WHOLE,
 ) -> Terms:
-    """The same objective with known canonical shapes S (N,3,P) in place of R^T [W; z]: equation 3, supervised."""
+    """Evaluate the objective with known canonical shapes S (N,3,P) in place of R^T [W; z]: equation 3, supervised."""
     code = networks.codes(views.W, views.visible, rows)
     shape, streams = _decoded(networks, recipe, code)
     distances = _distances(streams, S, own_points(views.visible, layout))
@@ -177,7 +148,7 @@ def _terms(
     distances: Tensor,
     share: Share,
 ) -> Terms:
-    """Weigh the distances of the streams (2,N) or (1,N), and the regularisers of codes (N,K) and shapes (N,3,P)."""
+    """Weigh the streams' distances (2,N) or (1,N) and the regularisers of codes (N,K) and shapes (N,3,P)."""
     handedness = bones = nuclear = none = shape.new_zeros(())
     *recon, size = share.whole(torch.cat([distances, code.square().sum(1)[None]]).T).mean(0).unbind()
     recon_ae, recon_ad = recon if len(recon) == 2 else (none, *recon)
@@ -196,28 +167,35 @@ def _terms(
         + recipe.code_weight * size
         + recipe.decay_weight * theta.dot(theta)
         + recipe.nuclear_weight * nuclear
-        # Frobenius norms grow with the square root of the number of points; these two do not.
+        # Unlike these two, Frobenius norms grow with the square root of the number of points.
         + shape.shape[2] ** 0.5 * (recipe.handedness_weight * handedness + recipe.bone_weight * bones)
     )
     return Terms(loss, recon_ae, recon_ad, size, handedness, bones, nuclear)
 
 
 @torch.no_grad()
-def undo_perspective(views: Views, depth: Tensor) -> Tensor:
-    """The points (N,2,P) that a weak-perspective camera would have seen, given relative depths (N,1,P) in units of W.
+def undo_perspective(views: NormalisedViews, depth: Tensor) -> Tensor:
+    """Return the points (N,2,P) that a weak-perspective camera would see.
 
-    A pinhole camera sees u = X / (d + Z); hence u (1 + Z/d) = X/d is what weak perspective of distance d sees.  Beyond
-    the paper, which names perspective as its next step; without it near bodies are bent to fit.
+    A pinhole camera sees u = X / (d + Z); hence weak perspective of distance d sees u (1 + Z/d) = X/d. The paper names
+    perspective as its next step. Without it near bodies are bent to fit.
+
+    Args:
+        views: calibrated views.
+        depth: (N,1,P) relative depths, units of W.
     """
     ray = views.size * views.W + views.centre
-    stretch = (1 + views.facing * views.size * depth).clamp(0.5, 2.0)  # while shapes are still wild
+    stretch = (1 + views.facing * views.size * depth).clamp(0.5, 2.0)  # early shapes are far off
     return centre(ray * stretch, views.visible) * views.visible[:, None] / views.size
 
 
 def own_points(visible: Tensor, layout: Layout) -> Tensor | None:
-    """The points (N,P) of each frame's category, that of most of its visible points; None where there is but one.
+    """Return a mask (N,P) of the points of each frame's category, that of most visible points.
 
-    A frame's object has no other points, so that what the networks make of them costs nothing.
+    Points of other categories do not exist in a frame, so the networks' guesses of them cost nothing.
+
+    Returns:
+        None for a layout without categories.
     """
     if not layout.categories:
         return None
@@ -228,17 +206,17 @@ def own_points(visible: Tensor, layout: Layout) -> Tensor | None:
 
 
 def _distances(streams: Tensor, target: Tensor, own: Tensor | None) -> Tensor:
-    """Frobenius distances (2,N) of streams (2,N,3,P) from target (N,3,P), unsquared, of own points (N,P) alone."""
+    """Return unsquared Frobenius distances (2,N) of streams (2,N,3,P) from a target (N,3,P), over own points (N,P)."""
     difference = streams - target if own is None else (streams - target) * own[:, None]
     # The small constant keeps the gradient finite at distance 0.
     return difference.square().sum((2, 3)).add(1e-8 * target.shape[2]).sqrt()
 
 
 def handedness_violation(S: Tensor, layout: Layout, margin: float = 0.5) -> Tensor:
-    """How far shapes (N,3,P) are from the layout's handedness rules: 0 where left x up points forward everywhere.
+    """Return how far shapes (N,3,P) violate the layout's handedness rules; 0 if left x up always points forward.
 
-    Two mirror images of a shape have the same orthographic views, and without a hint frames settle on either: the
-    model is then a mixture of both.  An anatomical rule, one bit of knowledge about the object, settles it.
+    Two mirror images of a shape have the same orthographic views. Without a hint some frames settle on each, and the
+    model mixes both. An anatomical rule, one bit of knowledge about the object, decides it.
     """
     if not layout.handedness:
         return S.new_zeros(())
@@ -254,9 +232,9 @@ def handedness_violation(S: Tensor, layout: Layout, margin: float = 0.5) -> Tens
 
 
 def bone_variation(S: Tensor, layout: Layout) -> Tensor:
-    """Relative variance of edge lengths over shapes (N,3,P): bones keep their lengths, and both sides have the same.
+    """Return the relative variance of edge lengths over shapes (N,3,P) and over both sides.
 
-    The first keeps depth honest, the second keeps the search out of lopsided solutions that explain the views as well.
+    Constant lengths keep depths right. Equal sides exclude lopsided solutions that explain the views as well.
     """
     if not layout.edges:
         return S.new_zeros(())

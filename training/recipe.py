@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from paul_ros.layout import Layout
-from training.errors import RecipeError, ViewsError
-from training.people.view_settings import ViewSettings
+from paul_ros.viewing_sphere import Scale
+from training import recipes
+from training.errors import RecipeError
+from training.recipes import recipe_names
 
-#: Settings that are one of a few words.
 CHOICES = {
     "codes": ("encoder", "free"),
     "encoder": ("residual", "convolutional"),
@@ -24,88 +27,126 @@ CHOICES = {
     "streams": ("both", "decoder"),
     "start": ("random", "rigid", "linear"),
 }
+"""Settings with a fixed set of values."""
+
 _POSITIVE = ("bottleneck", "width", "blocks", "learning_rate", "code_learning_rate", "restarts", "generations")
 _NOT_NEGATIVE = (
-    *("steps", "regression_steps", "hold", "batch", "patience", "roll", "stature"),
+    *("steps", "regression_steps", "hold", "batch", "seed", "roll"),
     *("code_weight", "decay_weight", "nuclear_weight", "handedness_weight", "bone_weight"),
 )
+_LARGEST = {"seed": 2**32 - 1, "batch": 2**20, "restarts": 10_000}
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Settings of a run. Where a default departs from the paper's, the comment says so.
+    """Settings of a run. Where a default differs from the paper's value, the list below gives the latter.
 
-    Weights multiply the terms of ``objective.py``; those of terms beyond the paper are per square root of the number
-    of points, as the Frobenius norms of the streams grow with it.
+    Weights multiply the terms of ``objective.py``. Weights of terms beyond the paper are per square root of the number
+    of points, because the Frobenius norms of the streams grow with it.
+
+    Attributes:
+        bottleneck: K, the size of a code. Paper: 4 for small or rigid objects, 8 for articulated ones.
+        hidden: layer sizes of f_d from the code upwards; f_e is its reverse.
+        codes: ``encoder``: phi = h(W, M), which lifts unseen frames. ``free``: one code a frame, the paper's NRSfM.
+        encoder: ``residual``, or ``convolutional`` as in Deep NRSfM; see ``networks.py``.
+        scale: ``free``: each frame has its own. ``unit``: orthographic views of one scale, as in NRSfM benchmarks.
+        width: of the 2D encoder's residual blocks.
+        blocks: number of these blocks.
+        streams: ``both``: f_d(phi) and f_d f_e f_d(phi). ``decoder``: the former alone, the paper's baseline ADL.
+        solver: of the cameras. ``exact``: global optimum. ``algebraic``: the paper's least squares and projection.
+        start: ``random`` weights, as in the paper; or ``rigid`` or ``linear``, shapes that the networks learn first.
+        regression_steps: steps in which the networks learn the start's shapes.
+        steps: steps of the objective. With 0 the start's shapes are the result.
+        hold: steps for which solutions of the lower level of all frames are held (beyond the paper). The networks
+            learn them as the cameras of other frames see them, and their detectors if the data has detections. With 0
+            the lower level is solved for each batch, as in the paper.
+        generations: of networks. Later ones start from what the last one made of the frames, without the tenth that it
+            explained worst: most frames that show the wrong mirror image are in that tenth.
+        batch: frames a step; 0 takes all.
+        learning_rate: of Adam, warmed up over 200 steps, then a cosine to zero, in each phase.
+        code_learning_rate: of free codes; each belongs to one frame.
+        seed: of all random numbers.
+        restarts: runs, with seeds from ``seed`` up. The one of the lowest final loss is kept.
+        code_weight: of |phi|^2. Paper: 0.01.
+        decay_weight: of |theta_d|^2. Paper: 1e-4.
+        nuclear_weight: of the nuclear norm of a batch's N shapes, over N. Paper, ADL + low rank: 0.01.
+        handedness_weight: keeps frames from settling on mirrored shapes (beyond the paper).
+        bone_weight: keeps the layout's edges at their lengths (beyond the paper).
+        upright: h sees every view turned and mirrored to one side, for cameras that roll freely; ``roll`` and
+            ``mirror_view`` are then not needed. Cameras, depths and rays are those of the original view, so that
+            perspective may be fitted. h loses gravity and the side that perspective shows to be near.
+        roll: radians, largest in-plane turn of W: an exact augmentation under an orthographic camera.
+        mirror_view: mirror W in x: the same shape seen from behind, exact too.
+        perspective: fit calibrated data by a pinhole camera (beyond the paper).
+        mirror_object: exchange left and right; only for symmetric objects.
+        known_lengths: (point, point, metres), which set the metres per model unit.
+        stature: metres, height of the people with these lengths; 0 for other objects.
+        views: settings of the synthetic views, for a folder of motion capture (``people/view_settings.py``).
     """
 
-    bottleneck: int = 8  # K; the paper: 4 for small or rigid objects, 8 for articulated ones
-    hidden: tuple[int, ...] = (16, 32, 64, 128, 256)  # f_d from the code upwards; f_e is its reverse
-    codes: str = "encoder"  # phi = h(W, M), to lift what was never seen; free: one code a frame, the paper's NRSfM
-    encoder: str = "residual"  # or convolutional, as Deep NRSfM's; see networks.py
-    scale: str = "free"  # every frame has its own; unit: orthographic views of one fixed scale, as NRSfM's benchmarks
-    width: int = 256  # of the 2D encoder's residual blocks
+    bottleneck: int = 8
+    hidden: tuple[int, ...] = (16, 32, 64, 128, 256)
+    codes: str = "encoder"
+    encoder: str = "residual"
+    scale: Scale = "free"
+    width: int = 256
     blocks: int = 2
-    streams: str = "both"  # f_d(phi) and f_d f_e f_d(phi); decoder: the first alone, the paper's baseline ADL
-    solver: str = "exact"  # of the cameras: the global optimum; algebraic: the paper's least squares and projection
-    start: str = "random"  # weights, as in the paper; rigid or linear: shapes that the networks first learn to give
-    regression_steps: int = 0  # that they learn them for
-    steps: int = 20_000  # of the objective; 0: the shapes of the start are the result
-    hold: int = 0  # steps that the lower level's solutions of all frames are held for, while the networks learn them as
-    # the cameras of other frames see them, and their detectors where the data has detections (beyond the paper); 0:
-    # solved anew for every batch, as the paper does
-    generations: int = 1  # of networks; each but the first starts from what the last one made of the frames, less the
-    # tenth that it explained worst: most frames that show the wrong mirror image are among those
-    batch: int = 256  # 0: all frames at every step
-    learning_rate: float = 1e-3  # Adam, warmed up over 200 steps, then a cosine to zero, in either phase
-    code_learning_rate: float = 1e-2  # of free codes, which each frame has to itself
-    patience: int = 0  # stop when so many steps lowered the mean loss by less than 0.1 %; 0: go through, which ends
-    # better: a run that is stopped never comes to the low rates of its schedule's end
+    streams: str = "both"
+    solver: str = "exact"
+    start: str = "random"
+    regression_steps: int = 0
+    steps: int = 20_000
+    hold: int = 0
+    generations: int = 1
+    batch: int = 256
+    learning_rate: float = 1e-3
+    code_learning_rate: float = 1e-2
     seed: int = 0
-    restarts: int = 1  # runs from this seed on; the one with the lowest final loss is kept
-    code_weight: float = 4.1231e-3  # the paper: 0.01
-    decay_weight: float = 0.0  # of |theta_d|^2; the paper: 1e-4
-    nuclear_weight: float = 0.0  # of the nuclear norm of a batch's N shapes, over N; the paper's ADL + low rank: 0.01
-    handedness_weight: float = 1.0  # beyond the paper: keeps frames from settling on mirrored shapes
-    bone_weight: float = 1.0  # beyond the paper: edges of the layout keep their lengths
-    upright: bool = False  # h sees every view turned and mirrored to one side: for cameras that roll freely, where it
-    # makes the next two needless. Only h does: cameras, depths and rays are those of the view as it is, so perspective
-    # may be fitted; what h no longer sees are gravity, and which side perspective shows to be near
-    roll: float = 0.3  # radians; in-plane turns of W, an exact augmentation under an orthographic camera
-    mirror_view: bool = True  # x-mirrored W is the same shape seen from behind: exact too
-    fade: tuple[float, float] = (1.0, 1.0)  # shares of the run between which roll and mirror_view fade out: where
-    # cameras stand upright, gravity tells a stoop from a view from above, and turned images blur that
-    perspective: bool = True  # beyond the paper: calibrated data is fitted by a pinhole camera
-    mirror_object: bool = False  # left and right exchanged: only for objects that are symmetric
-    hide: float = 0.0  # up to this share of a frame's points is hidden anew at every step
-    known_lengths: tuple[tuple[str, str, float], ...] = ()  # (point, point, metres): sets the metres per model unit
-    stature: float = 0.0  # metres, of the people who have these lengths; 0: no people
-    views: ViewSettings | None = (
-        None  # how people are seen, where the data is a folder of motion capture (view_settings.py)
-    )
+    restarts: int = 1
+    code_weight: float = 4.1231e-3
+    decay_weight: float = 0.0
+    nuclear_weight: float = 0.0
+    handedness_weight: float = 1.0
+    bone_weight: float = 1.0
+    upright: bool = False
+    roll: float = 0.3
+    mirror_view: bool = True
+    perspective: bool = True
+    mirror_object: bool = False
+    known_lengths: tuple[tuple[str, str, float], ...] = ()
+    stature: float = 0.0
+    views: dict[str, Any] | None = None
 
     @classmethod
-    def load(cls, name_or_path: str | Path, overrides: list[str] = ()) -> Recipe:
-        """Read a shipped recipe by name or any YAML file, then apply ``key=value`` or ``views.key=value`` overrides.
+    def load(cls, name_or_path: str | Path, overrides: Sequence[str] = ()) -> Recipe:
+        """Read a shipped recipe by name, or any YAML file, and apply overrides.
 
         A file may name a shipped recipe as its ``base``, whose settings it then changes.
+
+        Args:
+            name_or_path: of the recipe.
+            overrides: ``key=value`` or ``views.key=value``, values in YAML.
 
         Raises:
             RecipeError: unknown file, key or value.
         """
         settings = _read(name_or_path)
         for override in overrides:
-            key, equals, value = override.partition("=")
+            key, equals, text = override.partition("=")
             if not equals:
                 raise RecipeError(f"'{override}' is no override: write key=value")
             key, _, part = key.strip().partition(".")
-            value = _parsed(value, f"the value in '{override}'")
+            value = _parsed(text, f"the value in '{override}'")
             settings[key] = {**_mapping(settings.get(key), key), part: value} if part else value
         return cls.from_dict(settings)
 
     @classmethod
-    def from_dict(cls, settings: dict) -> Recipe:
-        """Check and build; raises RecipeError."""
+    def from_dict(cls, settings: dict[str, Any]) -> Recipe:
+        """Check settings and build the recipe.
+
+        Raises:
+            RecipeError: unknown key or value.
+        """
         fields = {field.name: field for field in dataclasses.fields(cls)}
         unknown = sorted(str(key) for key in settings if key not in fields)
         if unknown:
@@ -119,34 +160,38 @@ class Recipe:
             self._need(name, getattr(self, name) > 0, "positive")
         for name in _NOT_NEGATIVE:
             self._need(name, getattr(self, name) >= 0, "at least 0")
+        for name, largest in _LARGEST.items():
+            self._need(name, getattr(self, name) <= largest, f"at most {largest}")
+        self._need("stature", not self.stature or 1e-3 <= self.stature < 1e3, "0, or metres from 0.001 to 1000")
         self._need("hidden", self.hidden and all(type(size) is int and size > 0 for size in self.hidden), "layer sizes")
-        shares = [share for share in self.fade if type(share) in (int, float)]
-        self._need("fade", len(shares) == len(self.fade) == 2 and 0 <= shares[0] <= shares[1], "two growing shares")
-        self._need("hide", 0 <= self.hide < 1, "in [0, 1)")
         self._check_together()
 
     def _check_together(self) -> None:
-        """Refuse settings that are sound alone and not together."""
+        """Refuse settings that are valid alone but not together."""
         if self.codes == "free" and self.mirror_object:
             raise RecipeError("mirror_object needs codes: encoder, for the mirrored object has another code")
         if self.hold and (self.codes == "free" or self.start == "random"):
             raise RecipeError(
                 "hold needs codes: encoder, for a free code sees no other views, and a start other than random, for "
-                "what random networks make of the frames teaches nothing"
+                "solutions of random networks teach nothing"
             )
         if self.generations > 1 and not self.hold:
-            raise RecipeError("generations hand on solutions that are held: give the recipe hold, as 1000 steps")
+            raise RecipeError("generations need held solutions: give the recipe hold, such as 1000 steps")
         if self.start == "random" and not self.steps:
             raise RecipeError("with start: random and steps: 0 nothing is trained: choose start: linear, or some steps")
         if self.start != "random" and self.steps and not self.regression_steps:
-            raise RecipeError(f"start: {self.start} needs regression_steps, or the networks never learn of it")
+            raise RecipeError(f"start: {self.start} needs regression_steps, or the networks never learn it")
 
-    def _need(self, name: str, holds: object, what: str) -> None:
+    def _need(self, name: str, holds: object, needed: str) -> None:
         if not holds:
-            raise RecipeError(f"recipe setting {name} must be {what}, it is {getattr(self, name)!r}")
+            raise RecipeError(f"recipe setting {name} must be {needed}, it is {getattr(self, name)!r}")
 
     def check_points(self, layout: Layout) -> None:
-        """Refuse known lengths that are none between two points of the layout; raises RecipeError."""
+        """Check that known lengths lie between two points of the layout.
+
+        Raises:
+            RecipeError: one does not.
+        """
         for length in self.known_lengths:
             a, b, metres = length if isinstance(length, tuple) and len(length) == 3 else (None, None, None)
             between = a in layout.names and b in layout.names and a != b
@@ -156,27 +201,17 @@ class Recipe:
                     f"one is {length!r}"
                 )
 
-    def to_dict(self) -> dict:
-        """Plain lists and numbers, for YAML and the model's header; without views where there are none."""
-        plain = {
-            key: [list(item) if isinstance(item, tuple) else item for item in value]
-            if isinstance(value, tuple)
-            else value
-            for key, value in vars(self).items()
-            if key != "views"
-        }
-        return {**plain, "views": self.views.to_dict()} if self.views else plain
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers, for YAML and the model's header; absent views are left out."""
+        plain = {key: _plain(value) for key, value in vars(self).items()}
+        if self.views is None:
+            del plain["views"]
+        return plain
 
 
-def recipe_names() -> list[str]:
-    """Names of the shipped recipes."""
-    folder = resources.files("training") / "recipes"
-    return sorted(item.name[:-5] for item in folder.iterdir() if item.name.endswith(".yaml"))
-
-
-def _read(name_or_path: str | Path) -> dict:
+def _read(name_or_path: str | Path) -> dict[str, Any]:
     text = str(name_or_path)
-    path = resources.files("training") / "recipes" / f"{text}.yaml" if text in recipe_names() else Path(text)
+    path = resources.files(recipes) / f"{text}.yaml" if text in recipe_names() else Path(text)
     if not path.is_file():
         raise RecipeError(f"no recipe '{text}': neither a file nor one of {', '.join(recipe_names())}")
     settings = _parsed(path.read_bytes(), f"recipe '{text}'") or {}
@@ -190,26 +225,25 @@ def _read(name_or_path: str | Path) -> dict:
     return {**_read(base), **settings}
 
 
-def _parsed(text: str | bytes, what: str) -> object:
+def _parsed(text: str | bytes, source: str) -> Any:
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise RecipeError(f"{what} is no YAML: {' '.join(str(error).split())[:200]}") from None
+        raise RecipeError(f"{source} is no YAML: {' '.join(str(error).split())[:200]}") from None
 
 
-def _mapping(value: object, key: str) -> dict:
+def _mapping(value: object, key: str) -> dict[str, Any]:
     if value is not None and not isinstance(value, dict):
         raise RecipeError(f"recipe setting {key} has no settings of its own")
     return value or {}
 
 
-def _converted(key: str, value: object, default: object) -> object:
-    """The value in the default's type; lists become tuples."""
+def _converted(key: str, value: Any, default: Any) -> Any:
+    """Return the value in the default's type; lists become tuples."""
     if key == "views":
-        try:
-            return value if value is None or isinstance(value, ViewSettings) else ViewSettings.from_dict(value)
-        except ViewsError as error:
-            raise RecipeError(str(error)) from None
+        if value is None or isinstance(value, dict):
+            return value
+        raise RecipeError(f"recipe setting views must be settings as key: value, it is {value!r}")
     if isinstance(default, tuple) and isinstance(value, (list, tuple)):
         return tuple(tuple(item) if isinstance(item, list) else item for item in value)
     if isinstance(default, bool) and isinstance(value, bool):
@@ -219,8 +253,15 @@ def _converted(key: str, value: object, default: object) -> object:
     if type(default) in (int, float) and type(value) in (int, float, str):
         try:
             number = float(value)  # YAML 1.1 reads 1e-3 as text
-        except ValueError:
+        except (ValueError, OverflowError):
             number = math.nan
         if math.isfinite(number) and (type(default) is float or number.is_integer()):
             return type(default)(number)
     raise RecipeError(f"recipe setting {key} must be like {default!r}, it is {value!r}")
+
+
+def _plain(value: Any) -> Any:
+    """Return a setting's value with lists in place of tuples."""
+    if isinstance(value, dict):
+        return dict(value)
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reconstruct the very frames that a model is trained on: 2D in, 3D shapes out (non-rigid structure from motion)."""
+"""Reconstruct the training frames themselves: 2D in, 3D shapes out (non-rigid structure from motion)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,17 +17,22 @@ from torch import Tensor
 
 from paul_ros.errors import NpzError
 from paul_ros.files import read_npz, write_atomically
-from training.data import TrainingData, check_sizes
+from training.data import TrainingData
+from training.data_checks import check_sizes
 from training.distributed import processes
 from training.errors import DataError, TrainingError
-from training.objective import Views, fit, paul_terms
+from training.objective import fit, paul_terms
+from training.progress import Progress, ignore_progress
 from training.recipe import Recipe
 from training.solver import centre
-from training.start.kept_start import START_UNIT, Progress
+from training.start.search import START_UNIT
+from training.start.start import Start
 from training.trainer import Trainer
+from training.views import NormalisedViews
 
 _BATCH = 256
-_START_SHARE = 0.3  # of the work, as progress tells it
+_START_SHARE = 0.3
+"""Share of the work, for progress, of the search for a start."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +40,15 @@ class Reconstruction:
     """3D shapes of all training frames, in their cameras' frames.
 
     Attributes:
-        used: (G,) bool, of the frames as they were given those that these F are, in their order; the others showed too
-            few points.
-        shapes: (F,3,P) float32, image units, centred on the visible points: x and y of visible points as observed, all
-            else the mean of the streams (S_cam of the paper and of its supplement, equation 14).
+        used: (G,) bool over the given frames: True for the F that are reconstructed, in their order. The others showed
+            too few points.
+        shapes: (F,3,P) float32, image units, centred on the visible points. x and y of visible points are the observed
+            ones. All other coordinates are the mean of the streams (S_cam of the paper; supplement, equation 14).
         rotations: (F,3,3) float32, from the canonical to the camera frame.
-        codes: (F,K) float32; None where no networks were trained.
-        loss: of the objective over all frames as they are (or the score of the start, where no networks were trained);
-            comparable between seeds of one method, made without any ground truth.
-        seconds: of training, all restarts and the search for starts.
+        codes: (F,K) float32; None if no networks were trained.
+        loss: objective over all frames without augmentation, or the score of the start if no networks were trained.
+            Seeds of one method are comparable. No ground truth enters.
+        seconds: duration of all restarts, with their searches for a start.
     """
 
     used: np.ndarray
@@ -54,14 +60,14 @@ class Reconstruction:
 
     def save(self, path: str | Path) -> None:
         """Write an ``.npz`` of these arrays, atomically."""
-        arrays = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+        arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)
         write_atomically(path, buffer.getvalue())
 
 
 def load_reconstruction(path: str | Path) -> Reconstruction:
-    """Read what ``Reconstruction.save`` wrote.
+    """Read a file of ``Reconstruction.save``.
 
     Raises:
         DataError: there is no such file, or it holds something else.
@@ -74,7 +80,7 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
     if shapes.ndim != 3 or shapes.shape[1] != 3 or rotations.shape != (len(shapes), 3, 3):
         raise DataError(f"'{path}' is no saved reconstruction: shapes are {shapes.shape}, not (F,3,P)")
     if used.dtype != bool or used.ndim != 1 or used.sum() != len(shapes):
-        raise DataError(f"'{path}' is no saved reconstruction: used does not tell which frames its {len(shapes)} are")
+        raise DataError(f"'{path}' is no saved reconstruction: used does not show which frames its {len(shapes)} are")
     try:
         loss, seconds = float(arrays["loss"]), float(arrays["seconds"])
     except (TypeError, ValueError) as error:
@@ -83,31 +89,47 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
 
 
 @dataclass(frozen=True)
-class Run:
-    """A finished run and its loss, as in ``Reconstruction``; infinite where it diverged."""
+class FinishedRun:
+    """A finished run.
+
+    Attributes:
+        trainer: of the run.
+        loss: see ``Reconstruction``; infinite for a diverged run.
+    """
 
     trainer: Trainer
     loss: float
 
     @property
     def seed(self) -> int:
-        """Of the run."""
+        """The run's seed."""
         return self.trainer.recipe.seed
 
 
 Watch = Callable[[Trainer], None]
-"""Trains to the end; shows progress or not."""
+"""Function that trains a run to its end and may show progress."""
 
 
 def train_restarts(
     data: TrainingData, recipe: Recipe, folder: Path, device: torch.device | str, watch: Watch
-) -> list[Run]:
-    """Train the recipe's restarts one after the other, each in a folder of its own; best first, diverged ones last.
+) -> list[FinishedRun]:
+    """Train or continue the recipe's restarts one after the other, each in a folder of its own.
+
+    Args:
+        data: to train on.
+        recipe: with its number of restarts.
+        folder: of the runs.
+        device: of the networks.
+        watch: trains each run.
+
+    Returns:
+        The runs, best first, diverged ones last.
 
     Raises:
         TrainingError: all of them diverged; or see ``Trainer``.
     """
-    runs, diverged = [], None
+    runs: list[FinishedRun] = []
+    diverged = None
     for one in restarts(recipe):
         trainer = Trainer(data, one, run_folder(folder, recipe, one.seed), device)
         trainer.resume()
@@ -115,68 +137,73 @@ def train_restarts(
             watch(trainer)
         except TrainingError as error:
             unusable = recipe.start != "random" and trainer.start is None
-            if unusable or processes() > 1:  # a start that cannot be read; or others wait for this process
+            if unusable or processes() > 1:  # no start; or other processes would wait for this one
                 raise
             diverged = error
-            runs.append(Run(trainer, math.inf))
+            runs.append(FinishedRun(trainer, math.inf))
         else:
-            runs.append(Run(trainer, final_loss(trainer)))
+            runs.append(FinishedRun(trainer, final_loss(trainer)))
     if diverged and all(math.isinf(run.loss) for run in runs):
         raise diverged
     return sorted(runs, key=lambda run: run.loss)
 
 
 def restarts(recipe: Recipe) -> list[Recipe]:
-    """One recipe a restart: seeds count up from the recipe's."""
+    """Return a recipe for each restart; seeds count up from the recipe's."""
     return [replace(recipe, seed=recipe.seed + number, restarts=1) for number in range(recipe.restarts)]
 
 
 def run_folder(folder: Path, recipe: Recipe, seed: int) -> Path:
-    """Where a restart is kept: the folder itself if it is the only one."""
+    """Return the folder of a restart: the given folder itself if there is only one."""
     return folder if recipe.restarts == 1 else folder / f"seed_{seed}"
 
 
 def reconstruct(
     data: TrainingData, recipe: Recipe, folder: Path | None = None, progress: Progress | None = None
 ) -> Reconstruction:
-    """Run the whole pipeline, restarts included, and reconstruct the data's frames by the run of the lowest loss.
+    """Train all restarts, and reconstruct the data's frames by the run of lowest loss.
 
     Args:
-        folder: where runs are kept, and continued if they were interrupted; None keeps nothing.
-        progress: is told the share of the work that is done, 0 to 1.
+        data: to train on and to reconstruct.
+        recipe: of the runs.
+        folder: of the runs, which are continued if they were interrupted; None keeps nothing.
+        progress: called with the share of the work that is done.
 
     Raises:
-        DataError: with one scale for all, a frame would outweigh the others.
+        DataError: all frames have one scale, and one frame would outweigh the others.
         TrainingError: see ``Trainer``.
     """
     check_sizes(data, recipe.scale)
     if folder is None:
         with tempfile.TemporaryDirectory() as temporary:
             return reconstruct(data, recipe, Path(temporary), progress)
-    finished = 0
+    finished, show = 0, progress or ignore_progress
+    start_share = 0.0 if recipe.start == "random" else _START_SHARE if recipe.steps else 1.0
 
     def watch(trainer: Trainer) -> None:
         nonlocal finished
-        tell = (lambda done: None) if progress is None else (lambda done: progress((finished + done) / recipe.restarts))
-        begin = 0.0 if recipe.start == "random" else _START_SHARE if recipe.steps else 1.0
+
+        def advance(done: float) -> None:
+            show((finished + done) / recipe.restarts)
+
         try:
-            trainer.prepare(lambda done: tell(begin * done))
+            trainer.prepare(lambda done: advance(start_share * done))
             for row in trainer.run():
-                tell(begin + (1 - begin) * row["step"] / trainer.steps)
+                advance(start_share + (1 - start_share) * row["step"] / trainer.steps)
         finally:
             finished += 1
-        tell(0.0)
+        advance(0.0)
 
     runs = train_restarts(data, recipe, Path(folder), "cpu", watch)
     return reconstruction_of(runs)
 
 
 @torch.no_grad()
-def reconstruction_of(runs: list[Run]) -> Reconstruction:
-    """What the first of the runs, the best, makes of its frames.
+def reconstruction_of(runs: list[FinishedRun]) -> Reconstruction:
+    """Reconstruct the frames by the first run, the best.
 
     Raises:
-        TrainingError: no networks were trained and the start has not a shape for every frame.
+        TrainingError: no networks were trained, and the start lacks shapes of some frames.
     """
     trainer = runs[0].trainer
     frames, points = len(trainer.data.W), trainer.data.W.shape[2]
@@ -192,16 +219,16 @@ def reconstruction_of(runs: list[Run]) -> Reconstruction:
         if code is not None:
             codes[rows] = code.cpu().numpy()
     seconds = sum(run.trainer.seconds for run in runs)
-    codes = codes if trainer.recipe.steps else None
-    return Reconstruction(trainer.data.used, shapes, rotations, codes, runs[0].loss, seconds)
+    return Reconstruction(
+        trainer.data.used, shapes, rotations, codes if trainer.recipe.steps else None, runs[0].loss, seconds
+    )
 
 
 @torch.no_grad()
 def final_loss(trainer: Trainer) -> float:
-    """The objective's mean over all frames as they are, in fixed batches; the start's score if nothing was trained."""
+    """Return the objective's mean over all frames without augmentation, or the start's score without networks."""
     if not trainer.recipe.steps:
-        trainer.prepare()
-        return trainer.start.score
+        return _start_of(trainer).score
     recipe, total = trainer.recipe, 0.0
     for rows in _batches(len(trainer.data.W)):
         views, numbers = trainer.views(rows), rows.to(trainer.device)
@@ -211,25 +238,34 @@ def final_loss(trainer: Trainer) -> float:
 
 
 def _batches(frames: int) -> Iterator[torch.Tensor]:
-    """Frame numbers in parts that fit into memory whatever the number of frames."""
+    """Yield frame numbers in parts that fit into memory for any number of frames."""
     return iter(torch.arange(frames).split(_BATCH))
 
 
-Lift = Callable[[Tensor, Views], tuple[Tensor, Tensor, Tensor | None]]
-"""Frames' numbers (N,) and views to shapes (N,3,P) in camera frame and units of W, rotations (N,3,3), codes (N,K)."""
+Lift = Callable[[Tensor, NormalisedViews], tuple[Tensor, Tensor, Tensor | None]]
+"""Function from frame numbers (N,) and views to shapes, rotations and codes.
+
+Shapes are (N,3,P) in camera frame and units of W, rotations (N,3,3), codes (N,K) or None.
+"""
 
 
 def _by_networks(trainer: Trainer) -> Lift:
-    def lift(rows: Tensor, views: Views) -> tuple[Tensor, Tensor, Tensor]:
+    def lift(rows: Tensor, views: NormalisedViews) -> tuple[Tensor, Tensor, Tensor]:
         found = fit(trainer.networks, trainer.recipe, views, rows.to(trainer.device))
         return found.points, found.camera.R, found.code
 
     return lift
 
 
-def _by_start(trainer: Trainer) -> Lift:
+def _start_of(trainer: Trainer) -> Start:
     trainer.prepare()
-    start, frames = trainer.start, len(trainer.data.W)
+    if trainer.start is None:
+        raise TrainingError("the recipe starts from random weights and trains no networks: give it steps")
+    return trainer.start
+
+
+def _by_start(trainer: Trainer) -> Lift:
+    start, frames = _start_of(trainer), len(trainer.data.W)
     place = np.full(frames, -1)
     place[start.rows] = np.arange(len(start.rows))
     if (place < 0).any():
@@ -238,7 +274,7 @@ def _by_start(trainer: Trainer) -> Lift:
             f"regression_steps, so that networks reconstruct them all"
         )
 
-    def lift(rows: Tensor, views: Views) -> tuple[Tensor, Tensor, None]:
+    def lift(rows: Tensor, views: NormalisedViews) -> tuple[Tensor, Tensor, None]:
         R, S = (torch.from_numpy(array[place[rows]]).to(views.W) for array in (start.rotations, start.shapes))
         return START_UNIT[trainer.recipe.scale] * R @ S, R, None
 

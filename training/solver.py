@@ -6,13 +6,13 @@ Two ways:
 - ``solve_camera`` is the exact optimum as a differentiable function, by the implicit function theorem.
 - ``algebraic_camera`` is the paper's own approximation, least squares projected onto the rotations (section 4.2).
 
-Exact means the global optimum of ``paul_ros.onp``, which solves on the CPU; only second moments, 25 numbers a shape,
-travel there.
+Exact means the global optimum of ``paul_ros.onp``. It is solved on the CPU, which needs only the second moments, 25
+numbers a shape.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,8 +22,12 @@ from paul_ros import viewing_sphere
 
 Scale = viewing_sphere.Scale
 
-_RIDGE = 1e-4  # of the shape's squared size: keeps flat shapes solvable
-_FLAT = 1e-9  # of the moments: an optimum on a flatter hill is moved as if it were as steep
+_RIDGE = 1e-4
+"""Ridge as a share of the shape's squared size; keeps flat shapes solvable."""
+
+_FLAT = 1e-9
+"""Least curvature of the cost as a share of the moments; flatter optima are moved as if they had it."""
+
 _TINY = 1e-30
 
 
@@ -35,21 +39,21 @@ class Camera(NamedTuple):
 
 
 def centre(X: Tensor, visible: Tensor) -> Tensor:
-    """Points (...,N,D,P) minus the mean of the visible ones (N,P): the adaptive normalisation of section 4.3.
+    """Return points (...,N,D,P) minus the mean of the visible ones (N,P): the adaptive normalisation of section 4.3.
 
-    The printed line lacks the factor 1/v (v visible points) that its derivation gives; this is the derived form.
+    The printed line lacks the factor 1/v (v visible points) that its derivation gives. This is the derived form.
     """
     seen = visible[:, None].to(X.dtype)
     return X - X @ (seen / seen.sum(2, keepdim=True)).transpose(1, 2)
 
 
 def algebraic_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -> Camera:
-    """The paper's own solver: the least-squares affine camera M, its singular values set to their mean (or to 1).
+    """Solve as the paper does: the least-squares affine camera M, its singular values set to their mean (or to 1).
 
-    U V^T of M's singular value decomposition is its polar factor (M M^T)^(-1/2) M, which for two rows has a closed
-    form; that is smooth where the singular values coincide, as U and V are not. Differentiable in S and W.
+    U V^T of M's singular value decomposition is its polar factor (M M^T)^(-1/2) M, which has a closed form for two
+    rows. The closed form is smooth at equal singular values; U and V are not. Differentiable in S and W.
 
-    Args and returns are those of ``solve_camera``.
+    Arguments and returned values are those of ``solve_camera``.
     """
     seen = visible[:, None].to(S.dtype)
     S, W = centre(S, visible) * seen, centre(W, visible) * seen
@@ -65,16 +69,17 @@ def algebraic_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free
 
 
 def solve_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -> Camera:
-    """The global optimum of orthographic-N-point, differentiable in S and W.
+    """Return the global optimum of orthographic-N-point, differentiable in S and W.
 
     Args:
         S: (N,3,P) shapes, canonical frame.
-        W: (N,2,P) image points; anything finite where hidden.
+        W: (N,2,P) image points; hidden ones may have any finite value.
         visible: (N,P) bool, at least three a shape.
+        scale: ``free``, or ``unit`` for scale 1.
 
     Returns:
-        The camera that minimises ``|scale * R[:, :2] @ centre(S) - centre(W)|`` over the visible points; the identity
-        where they fix none (and scale 0 if that is free).
+        The camera that minimises ``|scale * R[:, :2] @ centre(S) - centre(W)|`` over the visible points. If these
+        determine none, R is the identity (and a free scale is 0).
     """
     R, s = _Optimum.apply(S, W, visible, scale)
     return Camera(R, s[:, None, None])
@@ -83,23 +88,21 @@ def solve_camera(S: Tensor, W: Tensor, visible: Tensor, scale: Scale = "free") -
 class _Optimum(torch.autograd.Function):
     """The best R (N,3,3) and scale (N,), with their derivatives by the implicit function theorem.
 
-    The cost |M S - W|^2 / 2 of M = s R_xy has no slope at the optimum.  Let it be moved to s e^v exp([w]x) R: the
-    slope in x = (w, v) is <M_i, D>, D = M A - B with A = S S^T and B = W S^T, and M_i what x_i does to M.  As moments
-    change the slope stays zero, and a loss whose gradient in x is g has, with u = H^-1 g and U = sum_i u_i M_i, the
-    gradient -M^T U in A and U in B.  In the camera's axes the cost's Hessian H is sparse: turns in the image plane and
-    the scale are coupled to tilts only, and are eliminated.
+    The cost |M S - W|^2 / 2 of M = s R_xy has zero slope at the optimum. Move the optimum to s e^v exp([w]x) R. The
+    slope in x = (w, v) is <M_i, D>, with D = M A - B, A = S S^T, B = W S^T and M_i the derivative of M in x_i. The
+    slope stays zero as moments change. Let g be the gradient of a loss in x, u = H^-1 g and U = sum_i u_i M_i. The
+    gradient is then -M^T U in A and U in B. In the camera's axes the cost's Hessian H is sparse: turns in the image
+    plane and the scale are coupled to tilts only, and are eliminated.
     """
 
     @staticmethod
-    def forward(
-        ctx: torch.autograd.function.FunctionCtx, S: Tensor, W: Tensor, visible: Tensor, scale: Scale
-    ) -> tuple[Tensor, Tensor]:
-        X = torch.cat([S, W], dim=1).double()  # in single precision what lies on one line would not look so
+    def forward(ctx: Any, S: Tensor, W: Tensor, visible: Tensor, scale: Scale) -> tuple[Tensor, Tensor]:
+        X = torch.cat([S, W], dim=1).double()  # single precision would miss points on one line
         X = centre(X, visible) * visible[:, None]
         moments = (X @ X.transpose(1, 2)).cpu().numpy()
         finite = np.isfinite(moments).all((1, 2))
         if not finite.all():
-            moments[~finite] = 0.0  # a training that diverged: its loss will tell
+            moments[~finite] = 0.0  # the loss of a diverged training reports it
         poses = viewing_sphere.solve(moments, np.zeros(moments.shape[:2]), scale, rivals=False)
         ctx.save_for_backward(X)
         ctx.optimum = moments, poses.R[:, 0], poses.scale[:, 0], poses.determined, scale
@@ -107,7 +110,7 @@ class _Optimum(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: torch.autograd.function.FunctionCtx, in_R: Tensor, in_s: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, in_R: Tensor, in_s: Tensor) -> tuple[Tensor | None, ...]:
         (X,) = ctx.saved_tensors
         in_moments = _slope_in_moments(*ctx.optimum, *(part.double().cpu().numpy() for part in (in_R, in_s)))
         in_X = torch.from_numpy(in_moments).to(X) @ X
@@ -123,9 +126,9 @@ def _slope_in_moments(
     in_R: np.ndarray,
     in_s: np.ndarray,
 ) -> np.ndarray:
-    """A loss's gradient in moments (N,5,5), summed with its transpose, from that in R (N,3,3) and s (N,).
+    """Return a loss's gradient in moments (N,5,5), plus its transpose, from that in R (N,3,3) and s (N,).
 
-    It is 0 where no pose is determined.
+    Undetermined poses have gradient 0.
     """
     M = s[:, None, None] * R
     along = M.transpose(0, 2, 1)
@@ -138,7 +141,7 @@ def _slope_in_moments(
     least = _FLAT * (across + A[:, 2, 2] + abs(p) + abs(r)) + _TINY
     over_roll = 1 / np.maximum(across - p - r, least)
     over_size = (scale == "free") / np.maximum(across, least)
-    # Tilts (x, y) that remain once the roll z and the size have followed.
+    # Tilts (x, y), after elimination of the roll z and the size.
     gx = gx + over_roll * ax * gz + over_size * ay * g_size
     gy = gy + over_roll * ay * gz - over_size * ax * g_size
     xx = A[:, 2, 2] - r - over_roll * ax * ax - over_size * ay * ay
@@ -161,6 +164,6 @@ def _trace(M: Tensor) -> Tensor:
 
 
 def _affine_camera(A: Tensor, B: Tensor) -> Tensor:
-    """(N,2,3) least-squares affine camera B A^-1, step 1 of the paper's solver."""
+    """Return the least-squares affine cameras B A^-1 (N,2,3), step 1 of the paper's solver."""
     ridge = _RIDGE * _trace(A).clamp_min(1e-9) * torch.eye(3, dtype=A.dtype, device=A.device)
     return torch.linalg.solve(A + ridge, B, left=False)

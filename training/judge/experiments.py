@@ -31,11 +31,12 @@ from paul_ros.files import write_atomically
 from paul_ros.layout import anonymous_layout
 from paul_ros.normalisation import enough_visible
 from training import reconstruction
-from training.data import TrainingData, load_training_data
+from training.data import TrainingData
 from training.errors import DataError, RecipeError
 from training.judge.comparison import errors_of_signs
 from training.judge.prediction import MIN_POINTS
 from training.judge.truth import Sequence
+from training.loading import load_training_data
 from training.recipe import Recipe
 from training.reconstruction import Reconstruction
 from training.start.kept_start import START, start_identity

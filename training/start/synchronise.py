@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One mirror image for all frames: which of its two each frame of many viewpoints shows, from 2D alone.
+"""One mirror image for all frames, from 2D alone.
 
-An orthographic view fits a shape and its mirror image alike. Where cameras and poses vary much, a reconstruction is
-right up to its mirror image within each region of pose space, and regions disagree. Two frames of alike poses tell
-whether they agree: one is nearer to the other or to the other's mirror image. So frames are clustered by likeness up to
-mirroring, signs made equal within each cluster, and whole clusters flipped wherever the shapes then need fewer
-principal directions; a linear model refitted to the views tells whether that was right.
+An orthographic view fits a shape and its mirror image alike. If cameras and poses vary much, each region of pose space
+is right up to a mirror image, and regions disagree. Two frames of similar poses show whether they agree: each is nearer
+to the other, or to the other's mirror image. Frames are therefore clustered by similarity up to mirroring, and signs
+made equal within each cluster. Then whole clusters are flipped if the shapes need fewer principal directions
+afterwards. A linear model refitted to the views decides whether the flips were right.
 """
 
 from __future__ import annotations
@@ -17,16 +17,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.start.kept_start import Progress
-from training.start.linear_model import LinearModel, Observations
+from training.progress import Progress
+from training.start.linear_model import LinearModel
+from training.start.observations import Observations
 
-_AGREEING = 0.995  # of nearest neighbours: 1.00 on sequences of one camera path; 0.98 where a third is mirrored
+_AGREEING = 0.995
+"""Agreement of nearest neighbours above which nothing is done. Measured: 1.00 on sequences of one camera path, 0.98 if
+a third of the frames is mirrored."""
+
 _FLAT = 1e-4
-_TINY = 1e-100  # its cube is a number still
+_TINY = 1e-100  # whose cube is no zero yet
 _ROUNDS = 4
 _STAGES = ((5, 24), (6, 24), (6, 48), (8, 48))
-"""Principal directions that shapes may fill in a round's stages, and clusters. Few directions find the way from afar;
-many have room for mixtures of shapes and mirror images."""
+"""Principal directions and clusters of each stage of a round. Few directions help far from the solution; many have room
+for mixtures of shapes and mirror images."""
 _SWEEPS = 3
 _LEAST_CLUSTER = 8  # frames, on average
 _NEIGHBOURS = 10
@@ -37,16 +41,24 @@ _MEAN_ROUNDS = 10
 
 
 def mirrored(X: Tensor) -> Tensor:
-    """The other shapes (F,3,P) with the same views: depths reversed."""
+    """Reverse the depths of shapes (F,3,P), which leaves their views as they are."""
     return X * X.new_tensor([1.0, 1.0, -1.0])[:, None]
 
 
 def likeness(X: Tensor, Y: Tensor) -> tuple[Tensor, Tensor]:
-    """How alike shapes (M,3,P) and (N,3,P) are under the best rotation: (M,N) up to mirroring, and (M,N) sign.
+    """Compare shapes (M,3,P) with shapes (N,3,P) under the best rotation.
 
-    Shapes are centred on all their points. With singular values a >= b >= c of X Y^T, divided by the norms of X and Y,
-    the best rotation correlates them by a + b +- c, + where the determinant is positive; their mirror images by
-    a + b -+ c. Returned are a + b + c, 1 for one shape or its mirror image, and +- c, positive where both are the same.
+    Let a >= b >= c be the singular values of X Y^T, divided by the norms of X and Y. The best rotation correlates two
+    shapes by a + b +- c, + if the determinant is positive. It correlates one with the other's mirror image by
+    a + b -+ c.
+
+    Args:
+        X: (M,3,P) shapes, centred on all their points.
+        Y: (N,3,P) likewise.
+
+    Returns:
+        Similarity up to mirroring a + b + c (M,N), 1 for equal shapes and for mirror images; and agreement +- c (M,N),
+        positive for shapes that show the same mirror image.
     """
     X, Y = (S / S.flatten(1).norm(dim=1).clamp_min(_TINY)[:, None, None] for S in (X, Y))
     M = torch.einsum("mip,njp->mnij", X, Y)
@@ -55,7 +67,7 @@ def likeness(X: Tensor, Y: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _eigenvalues(A: Tensor) -> Tensor:
-    """Eigenvalues (...,3) of symmetric 3x3 matrices, falling, in closed form (Smith, 1961)."""
+    """Return eigenvalues (...,3) of symmetric 3x3 matrices, descending, in closed form (Smith, 1961)."""
     middle = A.diagonal(dim1=-2, dim2=-1).mean(-1)
     B = A - middle[..., None, None] * torch.eye(3, dtype=A.dtype)
     spread = (B.square().sum((-2, -1)) / 6).sqrt().clamp_min(_TINY)
@@ -65,7 +77,7 @@ def _eigenvalues(A: Tensor) -> Tensor:
 
 
 def aligned(X: Tensor) -> tuple[Tensor, Tensor]:
-    """Generalised Procrustes: shapes (F,3,P) turned onto their common mean, and the rotations (F,3,3) that do it."""
+    """Rotate shapes (F,3,P) onto their common mean (generalised Procrustes); return them and the rotations (F,3,3)."""
     mean = X[0]
     for _ in range(_MEAN_ROUNDS):
         R = _onto(X, mean)
@@ -75,7 +87,7 @@ def aligned(X: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _onto(X: Tensor, mean: Tensor) -> Tensor:
-    """Rotations (F,3,3) that turn shapes (F,3,P) onto one (3,P) (Kabsch)."""
+    """Return the rotations (F,3,3) of shapes (F,3,P) onto one shape (3,P) (Kabsch)."""
     U, _, V = torch.linalg.svd(mean @ X.transpose(1, 2))
     sign = torch.linalg.det(U @ V)
     U = torch.cat([U[:, :, :2], U[:, :, 2:] * sign[:, None, None]], 2)
@@ -83,7 +95,14 @@ def _onto(X: Tensor, mean: Tensor) -> Tensor:
 
 
 def fitted(X: Tensor, seen: Observations, bases: int, stages: tuple) -> LinearModel:
-    """The linear model of shapes (F,3,P) in camera frame, polished on what was seen; stages of sigma and iterations."""
+    """Return the linear model of shapes (F,3,P) in camera frame, polished on the views.
+
+    Args:
+        X: (F,3,P) shapes, camera frame.
+        seen: the views.
+        bases: K of the model.
+        stages: sigma and L-BFGS iterations of each.
+    """
     canonical, A = aligned(X)
     mean = canonical.mean(0)
     _, size, V = torch.linalg.svd((canonical - mean).flatten(1), full_matrices=False)
@@ -95,7 +114,7 @@ def fitted(X: Tensor, seen: Observations, bases: int, stages: tuple) -> LinearMo
 
 
 def agreeing_share(X: Tensor) -> float:
-    """How far nearest neighbours of shapes (F,3,P) show the same mirror image: 0 to 1, flat shapes hardly counting."""
+    """Return how far nearest neighbours of shapes (F,3,P) show one mirror image, 0 to 1; flat shapes hardly count."""
     close, sign = likeness(X, X)
     nearest = close.fill_diagonal_(-1.0).topk(min(3, len(X) - 1), dim=1).indices
     sign = torch.gather(sign, 1, nearest)
@@ -106,10 +125,10 @@ def agreeing_share(X: Tensor) -> float:
 def synchronised(
     model: LinearModel, seen: Observations, generator: np.random.Generator, progress: Progress
 ) -> LinearModel:
-    """A model whose frames show one mirror image; the one that is given, where they do.
+    """Return a model whose frames show one mirror image; a model that already has that is returned as it is.
 
-    After every round of flips the model is refitted to the views.  Of few frames or wild poses neighbours tell little
-    even at the truth: a round that makes the views less likely is taken back.
+    After every round of flips the model is refitted to the views. With few frames or extreme poses neighbours say
+    little, even at the truth. A round that makes the views less likely is therefore taken back.
     """
     X = _shapes(model, seen)
     if agreeing_share(X) >= _AGREEING:
@@ -117,10 +136,10 @@ def synchronised(
     bases, (sigma, _) = len(model.V) - 1, _REBUILT[-1]
     least = _settled(model, seen).objective(seen, sigma, 0.0)
     for number in range(_ROUNDS):
-        tell = partial(_tell_part, progress, number, _ROUNDS)
+        advance = partial(_advance_round, progress, number)
         for stage, (directions, clusters) in enumerate(_STAGES):
             X = flipped(X, directions, clusters, generator)
-            tell((stage + 1) / (len(_STAGES) + 1))
+            advance((stage + 1) / (len(_STAGES) + 1))
         other = _rebuilt(X, seen, min(_BASES, bases), bases, generator)
         if (found := other.objective(seen, sigma, 0.0)) < least:
             model, least = other, found
@@ -128,12 +147,12 @@ def synchronised(
     return model
 
 
-def _tell_part(progress: Progress, number: int, parts: int, done: float) -> None:
-    progress((number + done) / parts)
+def _advance_round(progress: Progress, number: int, done: float) -> None:
+    progress((number + done) / _ROUNDS)
 
 
 def _rebuilt(X: Tensor, seen: Observations, few: int, bases: int, generator: np.random.Generator) -> LinearModel:
-    """The model of shapes (F,3,P) in camera frame: of few bases first, for its cameras to be searched for by them."""
+    """Return the model of shapes (F,3,P) in camera frame; a search with few bases first finds its cameras."""
     model = fitted(X, seen, few, _REFIT).searched(seen, _REFIT[-1][0], generator).widened(bases, generator)
     return _settled(model, seen)
 
@@ -145,16 +164,25 @@ def _settled(model: LinearModel, seen: Observations) -> LinearModel:
 
 
 def _shapes(model: LinearModel, seen: Observations) -> Tensor:
-    """Shapes (F,3,P) in camera frame as observed, centred on all points: on the visible ones no two would compare."""
+    """Return shapes (F,3,P) in camera frame with observed x and y.
+
+    They are centred on all points: shapes centred on different visible points could not be compared.
+    """
     X = seen.completed(model.in_camera(seen, _REBUILT[-1][0]))
     return X - X.mean(2, keepdim=True)
 
 
 def flipped(X: Tensor, directions: int, clusters: int, generator: np.random.Generator) -> Tensor:
-    """Shapes (F,3,P) in camera frame, clusters of them mirrored wherever that leaves less energy (``energy_outside``).
+    """Mirror clusters of shapes if that lowers their energy (``energy_outside``).
 
     Args:
-        clusters: at most so many.
+        X: (F,3,P) shapes, camera frame.
+        directions: principal directions that hold no energy.
+        clusters: largest number of clusters.
+        generator: of the order in which clusters are tried.
+
+    Returns:
+        Shapes (F,3,P).
     """
     clusters = min(clusters, max(2, len(X) // _LEAST_CLUSTER))
     close, sign = likeness(X, X)
@@ -173,7 +201,7 @@ def flipped(X: Tensor, directions: int, clusters: int, generator: np.random.Gene
 
 
 def energy_outside(X: Tensor, directions: int) -> float:
-    """Mean squared size of shapes (F,3,P), turned onto their mean, outside so many principal directions.
+    """Return the mean squared size of shapes (F,3,P), rotated onto their mean, outside some principal directions.
 
     A mixture of shapes and mirror images needs more directions than the shapes alone.
     """
@@ -184,10 +212,10 @@ def energy_outside(X: Tensor, directions: int) -> float:
 
 
 def _clusters(close: Tensor, count: int, generator: np.random.Generator) -> Tensor:
-    """Numbers (F,) of clusters by likeness (F,F): spectral embedding of the nearest neighbours, then k-means."""
+    """Return cluster numbers (F,) by similarity (F,F): spectral embedding of nearest neighbours, then k-means."""
     frames = len(close)
     near = close.topk(min(_NEIGHBOURS + 1, frames), dim=1)
-    distance = (1 - near.values).clamp_min(0)  # of points on one line rounding makes it negative
+    distance = (1 - near.values).clamp_min(0)  # rounding makes it negative for points on one line
     scale = distance[:, -1].median().clamp_min(1e-12)
     W = torch.zeros_like(close).scatter_(1, near.indices, (-distance / scale).exp())
     W = W + W.T
@@ -207,7 +235,7 @@ def _k_means(points: Tensor, count: int, generator: np.random.Generator) -> Tens
 
 
 def _spread_out(points: Tensor, count: int, generator: np.random.Generator) -> list[int]:
-    """Starts of k-means: each the farthest from those before."""
+    """Choose starts of k-means, each the farthest from those before."""
     chosen = [int(generator.integers(len(points)))]
     distance = (points - points[chosen[0]]).norm(dim=1)
     while len(chosen) < count:
@@ -217,7 +245,7 @@ def _spread_out(points: Tensor, count: int, generator: np.random.Generator) -> l
 
 
 def _agreeing(X: Tensor, close: Tensor, sign: Tensor, labels: Tensor) -> Tensor:
-    """Shapes of one mirror image within each cluster: by the leading eigenvector of their weighted agreements."""
+    """Give each cluster one mirror image, by the leading eigenvector of its weighted agreements."""
     X = X.clone()
     for cluster in range(int(labels.max()) + 1):
         rows = (labels == cluster).nonzero()[:, 0]

@@ -1,70 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The start: 3D shapes of some frames from their 2D points alone, by an annealed linear Procrustean model.
+"""Searches for a start: an annealed linear Procrustean model finds 3D shapes of some frames from 2D points alone.
 
 From random weights the auto-encoder's objective falls into poor local minima, although it is lower at the true shapes.
 A linear model with much noise has few minima; the noise is then lowered step by step (``linear_model.py``).
 
-1. Basin: many random starts on few frames, halved by likelihood on the way; the best few different ones go on to all
-   frames, and the most likely of them is taken. Random shapes, not rigid ones: the rigid factorisation of lowest
+1. Basin: many random starts on few frames, halved by likelihood on the way. The best few different ones go on to all
+   frames, and the most likely of them wins. Starts are random shapes, not rigid ones: the rigid factorisation of lowest
    residual can lie in a wrong basin.
-2. One mirror image for all frames, where many viewpoints have mixed them (``synchronise.py``).
-3. Detail: many bases and ever less noise. How little is right differs from data to data, and neither the likelihood nor
-   points held out tell. Two models of one half of the frames each do, by how far they differ about the depth of all
-   frames; the answer is the mean of both, over all levels of noise that are nearly as good as the best.
+2. One mirror image for all frames, if many viewpoints have mixed them (``synchronise.py``).
+3. Detail: many bases and ever less noise. The right level of noise differs from data to data. The likelihood and
+   held-out points do not show it. Two models show it, each fitted to one half of the frames, by their difference in
+   the depth of all frames. The result is the mean of both, over all levels that are nearly as good as the best.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from training.errors import StartError
-from training.start.kept_start import Progress
-from training.start.linear_model import LinearModel, Moments, Observations, centred_on_visible, random_rotations
+from training.progress import Progress, ignore_progress
+from training.start.linear_model import LinearModel, random_rotations
+from training.start.moments import Moments
+from training.start.observations import Observations, centred_on_visible
+from training.start.start import Start
 from training.start.synchronise import synchronised
 
-_STARTS = 48
-_START_FRAMES = 300
-_MAX_FRAMES = 1200
-_MAX_POINTS = 256
+_MAX_FRAMES, _MAX_POINTS = 1200, 256
 _MIN_VISIBLE = 3
+_STARTS, _START_FRAMES = 48, 300
 _CANDIDATES = 4
-_SAME_BASIN = 0.1  # nats a frame
-_BASES = (6, 10, 30)  # K of the starts, the candidates and the detail
-_WARM = ((1.0, 3.0, 15), (0.5, 2.0, 15), (0.3, 1.0, 20))  # sigma, penalty and steps of expectation maximisation
+
+_SAME_BASIN = 0.1
+"""Nats a frame; models of a smaller difference are in one basin."""
+
+_BASES = (6, 10, 30)
+"""K of the starts, the candidates and the detail."""
+
+# Stages of annealing: sigma, penalty, steps of expectation maximisation. Candidates have L-BFGS iterations as well.
+_WARM = ((1.0, 3.0, 15), (0.5, 2.0, 15), (0.3, 1.0, 20))
 _COOLER = ((0.2, 0.3, 20), (0.1, 0.1, 20))
-_COOLED = 60  # L-BFGS iterations after that
-_CANDIDATE = ((0.1, 0.03, 15, 60), (0.05, 0.01, 10, 60), (0.03, 0.0, 10, 160))  # and of L-BFGS iterations
-_DETAIL = ((0.03, 60), (0.015, 60), (0.0075, 80), (0.004, 100), (0.002, 100))  # sigma and L-BFGS iterations
-_SETTLING = 10
+_COOLED = 60
+"""L-BFGS iterations after the stages _COOLER."""
+_CANDIDATE = ((0.1, 0.03, 15, 60), (0.05, 0.01, 10, 60), (0.03, 0.0, 10, 160))
 _RIGID = ((1.0, 0.0, 20), (0.3, 0.0, 30))
 _RIGID_ITERATIONS = 100
 _RIGID_NOISE = 0.01
+
+_DETAIL = ((0.03, 60), (0.015, 60), (0.0075, 80), (0.004, 100), (0.002, 100))
+"""Sigma and L-BFGS iterations of the detail."""
+
+_SETTLING = 10
+"""Alternations of codes and cameras that fit the cameras of the other half to given bases."""
+
 _DOUBT_MARGIN = 1.25
-_BLOCK = 512  # points
+"""Levels of noise with at most so many times the least doubt are averaged."""
+
+_BLOCK = 512
+"""Points that are extended together."""
+
 _EXTENSION_RIDGE = 1e-3
-
-
-class Start(NamedTuple):
-    """Shapes to begin with.
-
-    Attributes:
-        rows: (n,) the frames they belong to.
-        shapes: (n,3,P) canonical frame, units of W, centred on the visible points: ``rotations @ shapes`` fits W.
-        rotations: (n,3,3), det +1, from the canonical to the camera frame. Which of the two mirror images of all this
-            is right, orthographic views do not tell.
-        score: mean negative log likelihood of a frame, lower is better; comparable between seeds.
-    """
-
-    rows: np.ndarray
-    shapes: np.ndarray
-    rotations: np.ndarray
-    score: float
 
 
 @contextmanager
@@ -73,25 +72,25 @@ def _breakdown_explained() -> Iterator[None]:
         yield
     except (np.linalg.LinAlgError, torch.linalg.LinAlgError) as error:
         raise StartError(
-            "the search for a start broke down on these image points: look for wild ones among them, "
+            "the search for a start broke down on these image points: look for outliers among them, "
             f"or choose start: random ({error})"
         ) from error
 
 
 @_breakdown_explained()
 def linear_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progress | None = None) -> Start:
-    """Shapes of up to 1200 frames by the linear model.
+    """Find shapes of up to 1200 frames by the linear model.
 
     Args:
-        W: (F,2,P) image points of one scale, root mean square coordinate 1; anything where hidden.
+        W: (F,2,P) image points of one scale, root mean square coordinate 1; hidden ones may have any value.
         visible: (F,P) bool.
         seed: of the random starts.
-        progress: is told the share of the work that is done, 0 to 1.
+        progress: called with the share of the work that is done.
 
     Raises:
-        StartError: fewer than two frames show three points, or the numbers are too wild.
+        StartError: fewer than two frames show three points, or the numbers are infinite or too large.
     """
-    generator, tell = np.random.default_rng(seed), progress or (lambda done: None)
+    generator, advance = np.random.default_rng(seed), progress or ignore_progress
     points = _chosen(W.shape[2], _MAX_POINTS, generator)
     usable = np.flatnonzero(visible[:, points].sum(1) >= _MIN_VISIBLE)
     if len(usable) < 2:
@@ -100,37 +99,37 @@ def linear_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progre
             "give more data, or choose start: random"
         )
     rows = usable[_chosen(len(usable), _MAX_FRAMES, generator)]
-    seen = Observations.of(W[np.ix_(rows, [0, 1], points)], visible[np.ix_(rows, points)])
-    basin = find_basin(seen, generator, lambda done: tell(0.4 * done))
-    basin = synchronised(basin, seen, generator, lambda done: tell(0.4 + 0.3 * done))
+    seen = Observations.of(W[np.ix_(rows, np.arange(2), points)], visible[np.ix_(rows, points)])
+    basin = find_basin(seen, generator, lambda done: advance(0.4 * done))
+    basin = synchronised(basin, seen, generator, lambda done: advance(0.4 + 0.3 * done))
     score = basin.objective(seen, _CANDIDATE[-1][0], 0.0)
-    shapes, rotations = find_detail(basin, seen, generator, lambda done: tell(0.7 + 0.3 * done))
+    shapes, rotations = find_detail(basin, seen, generator, lambda done: advance(0.7 + 0.3 * done))
     if len(points) < W.shape[2]:
         shapes = _extended(shapes, rotations, W[rows], visible[rows], points)
-    tell(1.0)
+    advance(1.0)
     return Start(rows, shapes, rotations, score)
 
 
 @_breakdown_explained()
 def rigid_start(W: np.ndarray, visible: np.ndarray, seed: int, progress: Progress | None = None) -> Start:
-    """One rigid shape for all frames, by the same search without bases; a baseline. Arguments as ``linear_start``."""
-    generator, tell = np.random.default_rng(seed), progress or (lambda done: None)
+    """Find one rigid shape for all frames, a baseline, by the same search without bases; see ``linear_start``."""
+    generator, advance = np.random.default_rng(seed), progress or ignore_progress
     seen = Observations.of(W, visible)
     models, (sigma, penalty, _) = [], _RIGID[-1]
     for number in range(_CANDIDATES):
         model = LinearModel.random(len(seen), seen.points, 0, generator)
         model = annealed(model, seen, _RIGID, generator)
         models.append(model.polished(seen, sigma, penalty, _RIGID_ITERATIONS))
-        tell((number + 1) / _CANDIDATES)
+        advance((number + 1) / _CANDIDATES)
     best = _best(models, seen, _RIGID[-1])[0]
-    # Without bases noise only weighs how sharply cameras are told, which shrinks a body that is rigid indeed.
+    # Without bases the noise only weighs the curvature in the cameras, which shrinks a truly rigid body.
     best = best.polished(seen, _RIGID_NOISE, penalty, _RIGID_ITERATIONS)
     shapes = centred_on_visible(best.V.expand(len(seen), -1, -1), seen.visible).numpy()
     return Start(np.arange(len(seen)), shapes, best.R.numpy(), best.objective(seen, _RIGID_NOISE, penalty))
 
 
 def find_basin(seen: Observations, generator: np.random.Generator, progress: Progress) -> LinearModel:
-    """The most likely of many random starts, fitted to all frames at a noise of 0.03."""
+    """Return the most likely of many random starts, fitted to all frames at a noise of 0.03."""
     bases = [min(bases, seen.points - 1) for bases in _BASES]
     some = seen[_chosen(len(seen), _START_FRAMES, generator)]
     models = []
@@ -153,7 +152,7 @@ def find_basin(seen: Observations, generator: np.random.Generator, progress: Pro
 def find_detail(
     basin: LinearModel, seen: Observations, generator: np.random.Generator, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes (F,3,P) and rotations (F,3,3) by two halves of the frames, at the noise where they agree; see above."""
+    """Return shapes (F,3,P) and rotations (F,3,3): two halves of the frames find the level of noise; see above."""
     order = generator.permutation(len(seen))
     halves = [np.sort(order[::2]), np.sort(order[1::2])]
     models = [LinearModel(basin.V, basin.R) for _ in halves]
@@ -169,7 +168,7 @@ def find_detail(
 
 
 def annealed(model: LinearModel, seen: Observations, stages: tuple, generator: np.random.Generator) -> LinearModel:
-    """Expectation maximisation through stages (sigma, penalty, steps), cameras searched for globally in each."""
+    """Run expectation maximisation through stages (sigma, penalty, steps), with one global search of cameras each."""
     for sigma, penalty, steps in stages:
         for step in range(steps):
             model = model.em_step(seen, sigma, penalty)
@@ -179,7 +178,7 @@ def annealed(model: LinearModel, seen: Observations, stages: tuple, generator: n
 
 
 def _chosen(count: int, limit: int, generator: np.random.Generator) -> np.ndarray:
-    """All of ``count`` numbers, or ``limit`` random ones in order."""
+    """Return all of ``count`` numbers, or ``limit`` random ones in order."""
     return np.arange(count) if count <= limit else np.sort(generator.choice(count, limit, replace=False))
 
 
@@ -188,7 +187,7 @@ def _best(models: list[LinearModel], seen: Observations, stage: tuple) -> list[L
 
 
 def _different(models: list[LinearModel], seen: Observations, stage: tuple) -> list[LinearModel]:
-    """Sorted models less those that are as good as the one before: starts that met in one basin."""
+    """Return sorted models, one for each basin: models as good as the one before are in its basin."""
     kept = models[:1]
     for model in models[1:]:
         if model.objective(seen, *stage[:2]) > kept[-1].objective(seen, *stage[:2]) + _SAME_BASIN:
@@ -197,7 +196,7 @@ def _different(models: list[LinearModel], seen: Observations, stage: tuple) -> l
 
 
 def _on_all_frames(model: LinearModel, seen: Observations, bases: int, generator: np.random.Generator) -> LinearModel:
-    """A model of few frames fitted to all, with more bases."""
+    """Fit a model of few frames to all, with more bases."""
     model = LinearModel(model.V, random_rotations(len(seen), generator)).searched(seen, 0.2, generator)
     model = model.widened(bases, generator)
     for sigma, penalty, steps, iterations in _CANDIDATE:
@@ -207,7 +206,7 @@ def _on_all_frames(model: LinearModel, seen: Observations, bases: int, generator
 
 
 def _fitted_to(half: np.ndarray, model: LinearModel, seen: Observations, sigma: float, iterations: int) -> LinearModel:
-    """Bases fitted to some frames, cameras of the others by these bases."""
+    """Fit bases to one half of the frames, and the cameras of the other half to these bases."""
     fitted = LinearModel(model.V, model.R[half]).polished(seen[half], sigma, 0.0, iterations)
     R = model.R.clone()
     R[half] = fitted.R
@@ -218,9 +217,9 @@ def _fitted_to(half: np.ndarray, model: LinearModel, seen: Observations, sigma: 
 
 
 def _doubt(views: list[Tensor], seen: Observations) -> float:
-    """Guess of the error of depth: how far two models differ, and how far they smooth what was observed.
+    """Estimate the error of depth: the difference of two models, and their distance from the observed points.
 
-    Too little noise lets each follow its own frames, too much rounds both off alike; the image shows that per axis.
+    With too little noise each model follows its own frames; with too much both smooth alike. The image shows how much.
     """
     apart = (seen.completed(views[0]) - seen.completed(views[1])).flatten(1).norm(dim=1).mean()
     off = sum((seen.completed(view) - view).flatten(1).norm(dim=1).mean() for view in views) / len(views)
@@ -230,12 +229,14 @@ def _doubt(views: list[Tensor], seen: Observations) -> float:
 def _extended(
     shapes: np.ndarray, rotations: np.ndarray, W: np.ndarray, visible: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Shapes (F,3,P) of all points, from those of some: each point is a linear function of the codes of these.
+    """Extend shapes of some points to all points (F,3,P), as linear functions of the codes of the former.
 
     Args:
-        shapes: (F,3,p) of the points with numbers ``points`` (p,), canonical frame, centred on the visible of them.
+        shapes: (F,3,p) canonical frame, centred on the visible points among them.
         rotations: (F,3,3).
-        W, visible: (F,2,P) and (F,P) of all points.
+        W: (F,2,P) of all points.
+        visible: (F,P) of all points.
+        points: (p,) numbers of the points that have shapes.
     """
     frames, _, total = W.shape
     shown = visible[:, None, points]
@@ -256,7 +257,7 @@ def _extended(
 
 
 def _codes(shapes: np.ndarray) -> np.ndarray:
-    """(F,K+1) principal codes (1, c) of flattened shapes (F,N), of unit variance."""
+    """Return principal codes (1, c) (F,K+1), of unit variance, of flattened shapes (F,N)."""
     frames = len(shapes)
     U, size, _ = np.linalg.svd(shapes - shapes.mean(0), full_matrices=False)
     kept = size[: _BASES[-1]] > 1e-6 * max(size[0], 1e-12)

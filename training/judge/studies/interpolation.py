@@ -16,10 +16,10 @@ from paul_ros.offline.replay import versions
 from paul_ros.offline.report import write_json
 from paul_ros.orthographic_n_point import onp
 from training.categories import among_categories
-from training.data import load_training_data
 from training.errors import DataError
 from training.judge.pictures import blue_to_red, draw_shape, frame_panels, new_figure, save_figure, turned_view
 from training.judge.truth import Sequence
+from training.loading import load_training_data
 
 _SHAPES = 9
 _PICTURE_ONLY = ("shapes", "seen", "edges")

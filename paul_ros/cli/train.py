@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`paul train`: 2D keypoints in, a model file out, or the 3D shapes of the given frames."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from paul_ros.extras import require
+from paul_ros.stream.parameters import DEFAULTS
+
+_EXAMPLES = """\
+examples:
+  paul train recording.mcap -o hand.npz --layout hand.yaml --set bottleneck=6
+  paul train CMU_FOLDER -o human.npz --recipe human                 views of motion capture: .asf and .amc, .bvh, .npz
+  paul train sequence.npz --recipe nrsfm --shapes shapes.npz        3D shapes of the given frames
+  paul train views.npz -o model.npz --set restarts=4                the run of the lowest final loss is kept
+  torchrun --nproc-per-node 4 --no-python paul train views.npz -o model.npz
+
+The run is kept in MODEL.run (or SHAPES.run): checkpoint.pt, log.csv and, if the recipe searches for a start, start.npz.
+The same command continues a stopped run, to the bit. Several processes train as one does, up to rounding.
+"""
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    """Add the command to `paul`."""
+    parser = commands.add_parser(
+        "train",
+        help="learn a 3D model of any object from 2D keypoints alone",
+        description="Learn a 3D shape model from 2D keypoints alone.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    _add_data_arguments(parser)
+    _add_output_arguments(parser)
+    _add_training_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train, or continue, and write what was asked for.
+
+    Raises:
+        PaulError: bad data, recipe or file, or a missing package.
+        KeyboardInterrupt: its text says what was stopped and how to go on.
+    """
+    require("train", "torch", "tqdm")
+    from training.options import TrainingOptions
+    from training.session import train
+
+    train(
+        TrainingOptions(
+            data=tuple(args.data),
+            model=args.output,
+            shapes=args.shapes,
+            json=args.json,
+            layout=args.layout,
+            topic=args.topic,
+            min_confidence=args.min_confidence,
+            recipe=args.recipe,
+            overrides=tuple(args.set),
+            fresh=args.fresh,
+            device=args.device,
+            threads=args.threads,
+            tensorboard=args.tensorboard,
+            quiet=args.quiet,
+            command=_command(),
+        )
+    )
+    return 0
+
+
+def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "data",
+        metavar="DATA",
+        type=Path,
+        nargs="+",
+        help="npz with W (F,2,P) and optional visible (F,P); a bag of 2D keypoints; or a folder of motion capture of "
+        "people. Several files are recordings of one layout, or else categories of objects, one a file",
+    )
+    parser.add_argument(
+        "--layout",
+        help="layout of the points: a shipped name, points41 for 41 points without names, or a YAML file "
+        "(default: coco17 for 17 points and for bags, else points without names)",
+    )
+    parser.add_argument("--topic", help="topic of the 2D keypoints, if a bag has several; * matches any part of a name")
+    parser.add_argument(
+        "--min-confidence",
+        type=_share,
+        default=DEFAULTS["min_confidence"],
+        metavar="C",
+        help="keypoints of a bag with a lower confidence count as hidden, as in the node (default: %(default)s)",
+    )
+
+
+def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--output", metavar="MODEL", type=Path, help="model file to write (.npz)")
+    parser.add_argument(
+        "--shapes",
+        metavar="SHAPES",
+        type=Path,
+        help="write the 3D shapes of the given frames (.npz); MODEL may then be left out",
+    )
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
+    parser.add_argument("--tensorboard", action="store_true", help="write logs for TensorBoard beside the checkpoint")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _add_training_arguments(parser: argparse.ArgumentParser) -> None:
+    from training.recipes import recipe_names
+
+    names = ", ".join(recipe_names())
+    parser.add_argument("--recipe", default="default", help=f"one of {names}, or a YAML file (default: %(default)s)")
+    parser.add_argument(
+        "--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe"
+    )
+    parser.add_argument("--fresh", action="store_true", help="start over instead of continuing the run beside MODEL")
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="device of the networks; auto uses a GPU if torch finds one (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=1,
+        metavar="N",
+        help="CPU threads; the networks are small, so more gain little, and lose much on a busy machine (default: 1)",
+    )
+
+
+def _share(text: str) -> float:
+    try:
+        share = float(text)
+    except ValueError:
+        share = -1.0
+    if not 0 <= share <= 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is no number from 0 to 1")
+    return share
+
+
+def _command() -> str:
+    """Return the command as typed, with bare file names: folders of one machine are no provenance."""
+    return " ".join(["paul", *(Path(word).name if "/" in word else word for word in sys.argv[1:])])

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""2D frames from a bag with one topic of 2D keypoints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import msg_adapters
+from paul_ros.extras import require
+from paul_ros.layout import Layout
+from paul_ros.placement import centred_view
+from training.data import RawFrames
+from training.errors import DataError
+
+
+def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: float) -> RawFrames:
+    """Read the keypoints of a bag; see ``load_training_data``.
+
+    Raises:
+        MissingPackageError: the packages that read bags are missing.
+        BagError: the bag cannot be read.
+        DataError: it has no keypoints of the layout, or several topics or cameras.
+    """
+    require("train", "mcap", "rosbags")
+    camera, image_size, rejections = _bag_camera(path)
+    frames = _bag_keypoints(path, layout, topic, image_size, rejections)
+    if not frames:
+        raise DataError(
+            f"'{path}' holds no 2D keypoints of layout '{layout.name}'{f' on topic {topic}' if topic else ''}"
+            f"{_reasons(rejections)}; name the right layout with --layout"
+        )
+    if len(frames) > 1:
+        raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
+    (messages,) = frames.values()
+    xy = np.concatenate([message.xy for message in messages])
+    visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for message in messages])
+    if camera is None:
+        return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False)
+    some = visible.any(1)
+    return RawFrames(centred_view(xy[some], visible[some], camera).W, visible[some], layout, calibrated=True)
+
+
+def _bag_keypoints(
+    path: Path,
+    layout: Layout,
+    topic: str | None,
+    image_size: tuple[int, int] | None,
+    rejections: dict[str, str],
+) -> dict[str, list[msg_adapters.Keypoints2D]]:
+    """Return keypoint messages by topic.
+
+    Args:
+        path: of the bag.
+        layout: of the points.
+        topic: that is read, with * for any part of a name; None reads all.
+        image_size: width and height in pixels, if known.
+        rejections: is given the last reason for which messages of a topic were rejected.
+    """
+    from paul_ros.offline.bag import matches, read_records
+
+    frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
+    for record in read_records(path):
+        name, type_name = record.topic, record.type_name
+        if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
+            continue
+        source = msg_adapters.Source(layout.names, image_size, name)
+        try:
+            keypoints = msg_adapters.read(type_name, record.message(), len(layout.names), source)
+        except msg_adapters.MessageError as error:
+            rejections[name] = str(error)
+        else:
+            if keypoints.persons:
+                frames.setdefault(topic or name, []).append(keypoints)
+    return frames
+
+
+def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, int] | None, dict[str, str]]:
+    """Return the camera, the size of its image, and rejected CameraInfo messages as reasons by topic.
+
+    Cameras are read before the keypoints: some keypoints are shares of the image size, and the first of them may come
+    before any CameraInfo.
+    """
+    from paul_ros.offline.bag import read_records
+
+    rejections: dict[str, str] = {}
+    cameras: set[msg_adapters.Intrinsics] = set()
+    sizes: set[tuple[int, int]] = set()
+    for record in read_records(path):
+        if record.type_name != "sensor_msgs/msg/CameraInfo":
+            continue
+        info = record.message()
+        # An uncalibrated camera has an image size too.
+        sizes.add((int(info.width), int(info.height)))
+        try:
+            cameras.add(msg_adapters.read_camera_info(info))
+        except msg_adapters.MessageError as error:
+            rejections[record.topic] = str(error)
+    count = max(len(cameras), len(sizes))
+    if count > 1:
+        raise DataError(f"'{path}' has CameraInfo of {count} cameras: keep that of the keypoints only")
+    return cameras.pop() if cameras else None, sizes.pop() if sizes else None, rejections
+
+
+def _reasons(rejections: dict[str, str]) -> str:
+    topics = {why: [name for name in sorted(rejections) if rejections[name] == why] for why in rejections.values()}
+    return "".join(f"; refused on {' and '.join(names)}: {why}" for why, names in topics.items())

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of motion capture as training data: people seen by random cameras and imperfect detectors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from paul_ros.layout import load_layout
+from training.data import TrainingData
+from training.distributed import from_first
+from training.errors import DataError, MocapError
+from training.loading import load_training_data
+from training.options import TrainingOptions
+from training.people.human_data import check_outside, make_file, motion_files, views_of
+from training.people.mocap import human_layout
+from training.preflight import check_recipe
+from training.recipe import Recipe
+
+VIEWS_FILE = "views.npz"
+"""File of the views in the run's folder."""
+
+
+def is_motion_capture(folder: Path) -> bool:
+    """Return whether the folder holds files of motion capture."""
+    return bool(motion_files(folder))
+
+
+def check_motion_capture(options: TrainingOptions) -> None:
+    """Check that no output lies in the folder that is read.
+
+    Raises:
+        MocapError: the next run would take an output for motion capture.
+    """
+    check_outside(options.data[0], options.outputs)
+
+
+def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
+    """Make views of a folder of motion capture, or load those that the run's folder keeps.
+
+    Views take minutes, so everything else is checked first. Only the first process makes them.
+
+    Args:
+        options: of the command.
+        recipe: with settings of the views.
+        device: of this process.
+
+    Returns:
+        The data, and the recipe with all settings of the views.
+
+    Raises:
+        RecipeError: the recipe has no views, or does not fit the layout.
+        DataError: the layout has other points than motion capture gives.
+        MocapError: the files cannot be used.
+    """
+    settings, path = views_of(recipe), options.run_folder / VIEWS_FILE
+    own = human_layout()
+    layout = load_layout(options.layout) if options.layout else own
+    if len(own.names) != len(layout.names):
+        raise DataError(
+            f"motion capture gives the {len(own.names)} points of layout {own.name}, not the {len(layout.names)} of "
+            f"{layout.name}: leave out --layout {options.layout}"
+        )
+    check_recipe(options, recipe, layout)
+
+    def make() -> bytes | None:
+        # An error that only one process raised would leave the others waiting: all get its text.
+        try:
+            if options.fresh:
+                path.unlink(missing_ok=True)
+            make_file(options.data[0], settings, path, quiet=options.quiet)
+        except (MocapError, OSError) as error:
+            return str(error).encode()
+        return None
+
+    if failure := from_first(make, device):
+        raise MocapError(failure.decode())
+    return load_training_data(path, layout), replace(recipe, views=settings.to_dict())
