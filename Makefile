@@ -7,7 +7,7 @@ PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --c
 SOURCES := setup.py setup.cfg pyproject.toml package.xml \
 	$(shell find paul_ros msg_adapters training lib launch config rviz foxglove sros2 resource bags -type f -not -path '*/__pycache__/*')
 
-.PHONY: setup demo test test-fast lint clean
+.PHONY: setup demo test test-fast lint docs clean
 
 setup: $(VENV)/.package
 
@@ -38,9 +38,9 @@ test: setup $(VENV)/.robot
 	$(PYTEST)
 	@$(MAKE) --no-print-directory lint
 
-# Without nodes, installs, training and long searches: for every save.
+# Without nodes, installs, training, pages and long searches: for every save.
 test-fast: setup
-	$(PYTEST) -m "not (dds or install or training or slow)"
+	$(PYTEST) -m "not (dds or install or training or docs or slow)"
 
 lint: setup
 	$(VENV)/bin/ruff check .
@@ -49,6 +49,10 @@ lint: setup
 
 demo: setup
 	$(VENV)/bin/paul demo
+
+# The pages, as HTML in out/docs.
+docs: setup
+	$(VENV)/bin/python -m sphinx -W --keep-going -q -b html docs out/docs
 
 clean:
 	rm -rf $(VENV) build install log out *.egg-info

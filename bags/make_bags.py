@@ -24,7 +24,7 @@ from msg_adapters.outputs import keypoints_cloud, pose_array  # noqa: E402
 from paul_ros.layout import load_layout  # noqa: E402
 from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_writer import BagWriter
-from training.people.mocap import layout_points  # noqa: E402
+from training.people.human_points import layout_points
 
 RATE = 30  # Hz
 START = 1_750_000_000 * 1_000_000_000  # ns, arbitrary

@@ -19,14 +19,16 @@ import torch
 from tqdm import tqdm
 
 from paul_ros.errors import PaulError
-from training.data import load_training_data
 from training.export import export_model
 from training.judge.truth import load_sequence
+from training.loading import load_training_data
 from training.people.human_data import make_file, views_of
 from training.people.human_points import human_layout
 from training.recipe import Recipe
 from training.reconstruction import final_loss
-from training.start.kept_start import START_UNIT, Start, kept_start, start_identity
+from training.start.kept_start import kept_start, start_identity
+from training.start.search import START_UNIT
+from training.start.start import Start
 from training.start.synchronise import aligned
 from training.trainer import Trainer
 

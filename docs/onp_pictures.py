@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from onp_tables import (
     SCALES,
-    Scale,
     bound,
     bound_looseness,
     energies,
@@ -27,9 +26,12 @@ from onp_tables import (
     with_best,
 )
 
+from paul_ros import OnP, onp
+from paul_ros import viewing_goal as vg
 from paul_ros import viewing_sphere as vs
+from paul_ros.arithmetic import Floats, Vector
 from paul_ros.extras import require
-from paul_ros.onp import OnP, onp
+from paul_ros.viewing_goal import Scale
 
 HERE = Path(__file__).resolve().parent
 _LEVELS = np.arange(0.25, 1.05, 0.05)
@@ -47,10 +49,10 @@ _BLUE, _ORANGE, _GREEN, _PINK, _GREY = "#0072B2", "#E69F00", "#009E73", "#CC79A7
 # --- the map of the viewing hemisphere
 
 
-def disc_frame(problem: vs.Problem, n: np.ndarray) -> np.ndarray:
+def disc_frame(problem: vg.Problem, n: np.ndarray) -> np.ndarray:
     """Return the map's frame, rows right, up and centre c, in which n and its Necker reversal lie level."""
     centre = np.array(problem.c) / np.linalg.norm(problem.c)
-    across = n - np.array(vs._reversal(tuple(n)))
+    across = n - np.array(vg.reversal(tuple(n)))
     across = across - (across @ centre) * centre
     across /= np.linalg.norm(across)
     return np.array([across, np.cross(centre, across), centre])
@@ -71,9 +73,9 @@ def disc_grid(frame: np.ndarray, size: int = 301) -> tuple[np.ndarray, np.ndarra
     return p, np.where(square <= 1, x, np.nan) @ frame
 
 
-def climb_path(problem: vs.Problem, n: vs.Vector, scale: Scale) -> np.ndarray:
+def climb_path(problem: vg.Problem, n: Vector, scale: Scale) -> np.ndarray:
     """Return the directions (steps,3) that the solver passes on its way up."""
-    return np.array([vs._climb(vs._Floats, problem, n, scale, steps).n for steps in range(12)])
+    return np.array([vg.newton(Floats, problem, n, scale, steps).n for steps in range(12)])
 
 
 def draw_maps(path: Path) -> None:
@@ -120,7 +122,7 @@ def _caption(found: OnP) -> str:
 
 
 def _draw_map(
-    axes: Any, problem: vs.Problem, V: np.ndarray, frame: np.ndarray, found: OnP, scale: Scale, R: np.ndarray
+    axes: Any, problem: vg.Problem, V: np.ndarray, frame: np.ndarray, found: OnP, scale: Scale, R: np.ndarray
 ) -> Any:
     """Draw residuals, climbs and marks on one map; returns the filled contours."""
     p, n = disc_grid(frame)
@@ -129,9 +131,9 @@ def _draw_map(
     filled = axes.contourf(*p.T, cost.T, _LEVELS, cmap="cividis", extend="both")
     axes.contour(*p.T, cost.T, np.arange(low, low + 0.3, 0.02), colors="white", linewidths=0.4, alpha=0.6)
     axes.add_patch(_circle())
-    start = vs._start(vs._Floats, problem)
+    start = vs.start_direction(Floats, problem)
     first = climb_path(problem, start, scale)
-    for directions in (first, climb_path(problem, vs._reversal(tuple(first[-1])), scale)):
+    for directions in (first, climb_path(problem, vg.reversal(tuple(first[-1])), scale)):
         way = to_disc(frame, directions)
         far = np.linalg.norm(np.diff(way, axis=0), axis=1) > 1.2  # past the rim, to the other side of the map
         way = np.insert(way, np.flatnonzero(far) + 1, np.nan, axis=0)
@@ -141,7 +143,7 @@ def _draw_map(
     for direction, marker, size, face, edge, label in (
         (best, "o", 15, "none", "white", "optimum"),
         (second, "s", 14, "none", "white", "second optimum"),
-        (np.array(vs._reversal(tuple(best))), "x", 8, "white", "white", "its Necker reversal, and the way up"),
+        (np.array(vg.reversal(tuple(best))), "x", 8, "white", "white", "its Necker reversal, and the way up"),
         (R[2] @ V, "*", 12, _PINK, "black", "true direction, before the noise"),
         (start, "^", 7, _ORANGE, "black", "start, and the way up"),
     ):

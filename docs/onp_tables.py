@@ -9,14 +9,15 @@ Random numbers have fixed seeds: every run prints the same tables.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
 
 import numpy as np
 
+from paul_ros import OnP, onp
+from paul_ros import viewing_goal as vg
 from paul_ros import viewing_sphere as vs
-from paul_ros.onp import OnP, onp
+from paul_ros.arithmetic import Arrays, map_tree
+from paul_ros.viewing_goal import Scale
 
-Scale = Literal["free", "unit"]
 SCALES: tuple[Scale, ...] = ("free", "unit")
 POINTS, NOISES, THICKNESSES = (3, 4, 6, 17, 100), (0.0, 0.1, 0.3, 1.0), (1.0, 0.3, 0.05)
 _STARTS = 60
@@ -47,7 +48,7 @@ def random_problems(
     return S, R[:, :2] @ S + noise * rng.standard_normal((count, 2, points)), R
 
 
-def reduced(S: np.ndarray, W: np.ndarray) -> tuple[vs.Problem, np.ndarray]:
+def reduced(S: np.ndarray, W: np.ndarray) -> tuple[vg.Problem, np.ndarray]:
     """Return the normalised problems in the principal axes of their shapes, and these axes (N,3,3) as columns."""
     S, W = S - S.mean(2, keepdims=True), W - W.mean(2, keepdims=True)
     size_S, size_W = np.linalg.norm(S, axis=(1, 2)), np.linalg.norm(W, axis=(1, 2))
@@ -55,16 +56,16 @@ def reduced(S: np.ndarray, W: np.ndarray) -> tuple[vs.Problem, np.ndarray]:
     V = V * np.linalg.det(V)[:, None, None]
     d = ((W[:, 0] + 1j * W[:, 1])[:, None] @ S.transpose(0, 2, 1) @ V)[:, 0] / (size_S * size_W)[:, None]
     c = np.cross(d.real, d.imag)
-    return vs.Problem(tuple((a / size_S[:, None] ** 2).T), tuple(d.T), tuple(c.T), size_S / (size_S + size_W)), V
+    return vg.Problem(tuple((a / size_S[:, None] ** 2).T), tuple(d.T), tuple(c.T), size_S / (size_S + size_W)), V
 
 
-def energies(problem: vs.Problem, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def energies(problem: vg.Problem, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return E and T of one problem for the directions n (...,3)."""
     a, d, c = (np.array(part) for part in problem[:3])
     return (n * n) @ a, (abs(d) ** 2).sum() - abs(n @ d) ** 2 + 2 * n @ c
 
 
-def goal(problem: vs.Problem, E: np.ndarray, T: np.ndarray, scale: Scale) -> np.ndarray:
+def goal(problem: vg.Problem, E: np.ndarray, T: np.ndarray, scale: Scale) -> np.ndarray:
     """Return the goal g that the optimum maximises, from E and T."""
     if scale == "free":
         return T / (1 - E)
@@ -77,9 +78,9 @@ def relative_residual(k: np.ndarray | float, g: np.ndarray, scale: Scale) -> np.
     return np.sqrt(np.maximum(square, 0))
 
 
-def single(problem: vs.Problem) -> vs.Problem:
+def single(problem: vg.Problem) -> vg.Problem:
     """Return the first of N problems, as floats."""
-    return vs._map(lambda values: values[0].item(), problem)
+    return map_tree(lambda values: values[0].item(), problem)
 
 
 def table(head: list[str], rows: list[list[str]]) -> list[str]:
@@ -170,16 +171,16 @@ def uncertified_table(count: int = 20000) -> list[str]:
     return table(head, rows)
 
 
-def optima(problem: vs.Problem, scale: Scale) -> np.ndarray:
+def optima(problem: vg.Problem, scale: Scale) -> np.ndarray:
     """Return the goal at all local optima (N, ``_MOST_OPTIMA``), best first, padded with -1.
 
     Optima are those that climbs from points all over the sphere find.
     """
     N = len(problem.k)
     known, goals, count = np.zeros((N, _MOST_OPTIMA, 3)), np.full((N, _MOST_OPTIMA), -1.0), np.zeros(N, int)
-    for view in vs._Arrays.climbs(problem, vs._fibonacci_sphere(_STARTS), scale):
+    for view in vg.climb_from_each(Arrays, problem, vs.fibonacci_sphere(_STARTS), scale):
         n = np.stack(view.n, axis=1)
-        new = vs._is_optimum(view) & ((known @ n[..., None])[..., 0].max(1) < vs._COS_APART) & (count < _MOST_OPTIMA)
+        new = vg.is_optimum(view) & ((known @ n[..., None])[..., 0].max(1) < vg.COS_APART) & (count < _MOST_OPTIMA)
         row = np.flatnonzero(new)
         known[row, count[row]], goals[row, count[row]] = n[row], view.g[row]
         count += new
@@ -246,7 +247,7 @@ def approximation_table(count: int = 4000) -> list[str]:
     return table(["points", "thickness", "median angle, °", "95 %, °", "residual over the optimum's, median"], rows)
 
 
-def bound(problem: vs.Problem, E: np.ndarray, T: np.ndarray, tau: float) -> np.ndarray:
+def bound(problem: vg.Problem, E: np.ndarray, T: np.ndarray, tau: float) -> np.ndarray:
     """Return the quadratic that touches the unit-scale goal where sqrt(T) is tau, and is nowhere below it."""
     return problem.k * E + (1 - problem.k) * (T / tau + tau)
 
@@ -254,12 +255,12 @@ def bound(problem: vs.Problem, E: np.ndarray, T: np.ndarray, tau: float) -> np.n
 def bound_looseness(S: np.ndarray, W: np.ndarray) -> float:
     """Return how far the bound rises above the best goal, over that goal."""
     problem, best = with_best(S, W, "unit")
-    E, T = energies(problem, np.array(vs._fibonacci_sphere(5000)))
+    E, T = energies(problem, np.array(vs.fibonacci_sphere(5000)))
     tau = np.sqrt(energies(problem, best)[1])
     return float(bound(problem, E, T, tau).max() / goal(problem, *energies(problem, best), "unit") - 1)
 
 
-def with_best(S: np.ndarray, W: np.ndarray, scale: Scale) -> tuple[vs.Problem, np.ndarray]:
+def with_best(S: np.ndarray, W: np.ndarray, scale: Scale) -> tuple[vg.Problem, np.ndarray]:
     """Return one problem and its best direction (3,), in the principal axes of the shape."""
     problems, V = reduced(S, W)
     return single(problems), onp(S, W, scale=scale).R[0, 2] @ V[0]

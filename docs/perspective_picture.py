@@ -17,10 +17,10 @@ import numpy as np
 from msg_adapters import Intrinsics
 from paul_ros import metrics
 from paul_ros.layout import load_layout
-from paul_ros.model import load_model
-from paul_ros.offline.bag import read_messages
+from paul_ros.model_file import load_model
+from paul_ros.offline.bag_reader import read_messages
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.onp import OnP, onp
+from paul_ros.orthographic_n_point import OnP, onp
 from paul_ros.pinhole_pose import refine
 from paul_ros.placement import centred_view, place
 

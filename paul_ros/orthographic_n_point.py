@@ -4,7 +4,7 @@
 The function ``onp`` minimises ``sum_j w_j |s R_xy S_j + t - W_j|^2`` over rotations R, translations t and, in the
 free-scale problem, s > 0.
 
-The page ``docs/onp.md`` reduces this to a smooth function on the sphere of viewing directions and derives the
+The page ``docs/explanation/onp.md`` reduces this to a smooth function on the sphere of viewing directions and derives the
 proof of global optimality.  The module ``paul_ros.viewing_sphere`` has the solver; ``paul benchmark onp`` measures it.
 """
 
@@ -41,7 +41,7 @@ class OnP(NamedTuple):
             uncorrelated.  Extents must be at least 1e-12 of the distance from the origin, and from 1e-70 to 1e150.
             Coordinates and weights must be finite, and weights not negative.
         two_fold: (N,) bool, a second, depth-reversed optimum was found, and its viewing direction is more than 0.05
-            radians from the first.  At most 0.4 % of the existing ones are missed (docs/onp.md).
+            radians from the first.  At most 0.4 % of the existing ones are missed (docs/explanation/onp.md).
         R_mirror, scale_mirror, translation_mirror, residual_mirror: the second optimum; without one, the Necker
             reversal of the first (its reflection about the axis along which the shape is thinnest).
         extent: (N,) weighted root mean square distance of the image points from their mean, image units.

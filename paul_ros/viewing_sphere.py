@@ -2,7 +2,7 @@
 """Orthographic-N-point, reduced to the viewing direction n and solved on the sphere of directions.
 
 The module ``paul_ros.viewing_goal`` has the goal g(n) and the climb.  The best pose that looks along n is
-``r1 + i r2 = u z/|z|``, and the best n has the largest g.  The page ``docs/onp.md`` derives this and proves the
+``r1 + i r2 = u z/|z|``, and the best n has the largest g.  The page ``docs/explanation/onp.md`` derives this and proves the
 certificate.
 """
 

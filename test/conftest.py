@@ -217,7 +217,8 @@ FOCAL, CENTRE = 600.0, (320.0, 240.0)
 def model_file(tmp_path_factory) -> Path:
     """A model file that gives PERSON for every input: all weights are zero except the last bias."""
     from paul_ros.layout import load_layout
-    from paul_ros.model import save_model, to_unit_size, weight_shapes
+    from paul_ros.model_file import save_model, weight_shapes
+    from paul_ros.normalisation import to_unit_size
 
     layout = load_layout("coco17")
     shape = to_unit_size(PERSON.T[None], layout)[0]
@@ -244,7 +245,9 @@ def model_file(tmp_path_factory) -> Path:
 def coco_model():
     """Return the shipped model reduced to COCO-17, without the weights of the other points."""
     from paul_ros.layout import load_layout
-    from paul_ros.model import Model, load_model, to_unit_size
+    from paul_ros.model import Model
+    from paul_ros.model_file import load_model
+    from paul_ros.normalisation import to_unit_size
 
     human, coco = load_model(), load_layout("coco17")
     own = np.array([human.layout.names.index(name) for name in coco.names])
@@ -299,7 +302,15 @@ class LifterProcess:
         env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
         with open(self._log, "wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "paul_ros.ros.node", "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
+                [
+                    sys.executable,
+                    "-m",
+                    "paul_ros.ros.lifter_process",
+                    "--ros-args",
+                    "-r",
+                    f"__ns:=/{namespace}",
+                    *ros_args,
+                ],
                 cwd=ROOT,
                 env=env,
                 stdout=log,

@@ -167,7 +167,7 @@ import sys
 sys.path.insert(0, sys.argv[2])
 import numpy as np
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 xy = np.random.default_rng(5).normal(320, 80, (3, 17, 2))
 visible = np.ones((3, 17), dtype=bool)
 visible[1, 4:9] = False

@@ -14,7 +14,8 @@ import msg_adapters
 from msg_adapters.keypoints import stamp_ns
 from paul_ros.layout import load_layout
 from paul_ros.offline.bag_reader import read_messages, topics_of
-from training.people.mocap import CMU31, layout_points
+from training.people.human_points import layout_points
+from training.people.mocap import CMU31
 
 BAGS = Path(__file__).resolve().parent.parent / "bags"
 NAMES = {"one_person.mcap": 585, "two_persons_crossing.mcap": 390}

@@ -13,8 +13,9 @@ from tiny_data import FROM_RANDOM_WEIGHTS
 
 from paul_ros.cli import train as cli
 from paul_ros.layout import Layout, anonymous_layout, load_layout
-from paul_ros.lifter import TOO_FEW_POINTS, Lifter
-from paul_ros.model import load_model
+from paul_ros.lifted import TOO_FEW_POINTS
+from paul_ros.lifter import Lifter
+from paul_ros.model_file import load_model
 from training.categories import among_categories, joint_layout, load_files
 from training.errors import DataError
 from training.judge.evaluation import evaluate_model

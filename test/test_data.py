@@ -12,8 +12,8 @@ from test_foreign_bags import BODIES, FRAMES, IDS, PIXELS, Factory, image_messag
 
 from msg_adapters import read_camera_info
 from paul_ros.layout import load_layout
-from paul_ros.model import enough_visible
-from paul_ros.offline.bag import BagWriter
+from paul_ros.normalisation import enough_visible
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.placement import centred_view
 from training import data as module
 from training.data_checks import check_sizes

@@ -10,7 +10,8 @@ from conftest import CENTRE, FOCAL, camera_info, header_of, persons_at, seen
 from msg_adapters import MessageError, outputs, read_depth
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
-from paul_ros.offline.bag import BagMessages, BagWriter
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.replay import replay
 from paul_ros.stream.depth import SIGMA, SURFACE
 from paul_ros.stream.stream import LiftStream, open_stream

@@ -16,7 +16,7 @@ from msg_adapters import outputs
 from msg_adapters.palette import SIDE_COLOURS
 from paul_ros import cli
 from paul_ros.errors import BagError, PictureError
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.offline import film, film_excerpt, film_model, film_stage
 from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_writer import BagWriter

@@ -16,7 +16,7 @@ from paul_ros import cli
 from paul_ros.errors import BagError
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.offline.bag_reader import matches, read_records
 from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_writer import BagWriter

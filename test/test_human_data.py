@@ -15,10 +15,11 @@ import pytest
 from people_data import captured_joints
 from test_distributed import TORCHRUN
 
-from paul_ros.model import load_model
-from training import command as cli
-from training.data import load_training_data
+from paul_ros.cli import train as cli
+from paul_ros.model_file import load_model
+from training import motion_capture
 from training.errors import DataError, MocapError, RecipeError, ViewsError
+from training.loading import load_training_data
 from training.people import human_data
 from training.people.human_points import human_layout
 from training.people.view_settings import ViewSettings
@@ -134,7 +135,7 @@ def test_the_command_overwrites_nothing_that_it_reads_or_writes(archive, tmp_pat
         ((archive, "-o", capture), "read as motion capture"),
         ((archive, "-o", archive / "new.npz"), "read as motion capture"),
         ((archive, "-o", out, "--truth", archive / "3d.npz"), "read as motion capture"),
-        ((tmp_path / "linked", "-o", capture), "is what is read"),
+        ((tmp_path / "linked", "-o", capture), "would overwrite an input"),
         ((archive, "-o", out, "--truth", tmp_path / "linked" / ".." / "2d.npz"), "named for two outputs"),
         ((archive, "-o", tmp_path / "views.txt"), "must end in .npz, not 'views.txt'"),
         ((archive, "-o", out, "--truth", tmp_path / "truth"), "must end in .npz, not 'truth'"),
@@ -229,7 +230,7 @@ def test_a_folder_is_trained_on_by_one_command(archive, tmp_path, monkeypatch, c
     ],
 )
 def test_errors_that_need_no_views_come_before_views_are_made(archive, tmp_path, monkeypatch, words, error, message):
-    monkeypatch.setattr(cli, "make_file", lambda *given, **named: pytest.fail("views were made"))
+    monkeypatch.setattr(motion_capture, "make_file", lambda *given, **named: pytest.fail("views were made"))
     with pytest.raises(error, match=message):
         cli.run(arguments_of_train(archive, "-o", tmp_path / "human.npz", "--recipe", "human", *words))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-from paul_ros.lifter import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS
+from paul_ros.lifted import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS
 from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.reasons import DROP, NOTE, PERSON, REASONS
 

@@ -20,7 +20,7 @@ from msg_adapters import Source
 from paul_ros import cli
 from paul_ros.layout import load_layout
 from paul_ros.offline import keypoint_files
-from paul_ros.offline.bag import read_messages
+from paul_ros.offline.bag_reader import read_messages
 from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import open_stream
 

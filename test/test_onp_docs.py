@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_links import broken_links
 
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 sys.path.append(str(DOCS))
@@ -80,7 +80,7 @@ def test_goal_and_residual_as_written(scale):
         W = 3.0 * W
         problems, V = pictures.reduced(S, W)
         problem, found = pictures.single(problems), onp(S, W, scale=scale)
-        every = np.array(pictures.vs._fibonacci_sphere(500))
+        every = np.array(pictures.vs.fibonacci_sphere(500))
         n = np.concatenate([found.R[:1, 2] @ V[0], every])
         g = pictures.goal(problem, *pictures.energies(problem, n), scale)
         residual = pictures.relative_residual(problem.k, g, scale) * np.sqrt(W[0].var(1).sum())

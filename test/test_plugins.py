@@ -19,8 +19,9 @@ from node_bench import Bench
 import msg_adapters
 from msg_adapters import Adapter, Keypoints2D, MessageError, WrongPointCount, plugins, record
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
-from paul_ros.offline.bag import BagMessages, BagWriter
+from paul_ros.model_file import load_model
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.stream.stream import LiftStream
 
 PEOPLE = "acme_msgs/msg/People"
@@ -235,20 +236,20 @@ def test_a_broken_adapter_costs_its_messages(plug, model_file, case):
     stream = LiftStream(Lifter(load_model(model_file)), None, 0.3, 64)
     assert PEOPLE in msg_adapters.SUPPORTED
     for _ in range(2):
-        assert stream.keypoints(PEOPLE, MESSAGE) is None
-    assert stream.drops == {reason: 2}
-    assert word in stream.explanations[reason]
+        assert stream.keypoints(PEOPLE, MESSAGE).frame is None
+    assert stream.ledger.drops == {reason: 2}
+    assert word in stream.ledger.advice[reason]
     if reason in ("broken_adapter", "adapter_failed"):
-        assert "the Python package acme 1.0" in stream.explanations[reason]
-        assert "\n" not in stream.explanations[reason]
+        assert "the Python package acme 1.0" in stream.ledger.advice[reason]
+        assert "\n" not in stream.ledger.advice[reason]
 
 
 def test_a_sound_one_is_lifted_and_asked_for_its_kind(plug, model_file):
     plug(Point(Adapter(lambda *_: sound(), lambda _: "coco17", one_person=True)))
     stream = LiftStream(Lifter(load_model(model_file)), None, 0.3, 64)
     assert PEOPLE in msg_adapters.ONE_PERSON
-    assert stream.keypoints(PEOPLE, MESSAGE) is None
-    assert stream.flush().lifted.ok.all() and not stream.drops
+    assert stream.keypoints(PEOPLE, MESSAGE).frame is None
+    assert stream.flush().lifted.ok.all() and not stream.ledger.drops
 
 
 def test_a_broken_one_is_of_no_kind(plug):

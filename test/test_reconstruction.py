@@ -12,9 +12,9 @@ from test_training import train
 from tiny_data import centred, sequence, true_start
 
 from paul_ros import cli as paul
-from paul_ros.errors import BagError, MissingPackageError
+from paul_ros.errors import MissingPackageError, OutputError
 from paul_ros.metrics import normalised_error
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from training import reconstruction, session
 from training.encoder_fit import fit_encoder
 from training.errors import DataError, RecipeError, TrainingError
@@ -236,7 +236,7 @@ def test_fresh_forgets_the_start(file, tmp_path, monkeypatch):
 
 def test_no_output_overwrites_the_kept_start(file, tmp_path):
     (tmp_path / "m.run").mkdir()
-    with pytest.raises(BagError, match="two outputs"):
+    with pytest.raises(OutputError, match="two outputs"):
         train(file, "-o", tmp_path / "m.npz", "--json", tmp_path / "m.run" / "start.npz", *AS_OPTIONS)
 
 

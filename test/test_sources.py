@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny_data import sequence
 
-from paul_ros.model import load_model, save_model
+from paul_ros.model_file import load_model, save_model
 from training.recipe import Recipe
 from training.sources import DataKind, kind_of
 

@@ -17,7 +17,7 @@ from msg_adapters import outputs
 from paul_ros.errors import LayoutError, ModelError, ParameterError
 from paul_ros.layout import Layout, load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
+from paul_ros.model_file import load_model
 from paul_ros.stream.messages import MessageBuilder
 from paul_ros.stream.stream import LiftStream, Outcome, open_stream
 
@@ -272,7 +272,8 @@ def test_the_same_messages_give_the_same_bits(model_file, make):
 
 def superset_model(model_file, tmp_path):
     """Return a model of all points of COCO-17, BODY_25 and one more; it always has the fixture's shape."""
-    from paul_ros.model import save_model, to_unit_size, weight_shapes
+    from paul_ros.model_file import save_model, weight_shapes
+    from paul_ros.normalisation import to_unit_size
 
     coco, body = load_layout("coco17"), load_layout("body25")
     names = [*coco.names, *(name for name in body.names if name not in coco.names), "head_top"]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tiny_data import sequence, true_start
 
 from paul_ros.layout import load_layout
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 from training.checkpoint import LOG_COLUMNS
 from training.chirality import rule_share
 from training.encoder_fit import fit_encoder

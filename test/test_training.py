@@ -16,16 +16,19 @@ from tiny_data import FROM_RANDOM_WEIGHTS
 
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros.cli import train as cli
-from paul_ros.errors import BagError, ModelError
+from paul_ros.errors import ModelError, OutputError
 from paul_ros.layout import load_layout
 from paul_ros.model_file import load_model
-from paul_ros.offline.bag import BagMessages, BagWriter, read_messages, read_records
+from paul_ros.offline.bag_reader import read_messages, read_records
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import open_stream
 from training.errors import DataError, RecipeError, TrainingError
 from training.export import mean_shape, metres_per_unit
 from training.loading import load_training_data
-from training.recipe import Recipe, recipe_names
+from training.recipe import Recipe
+from training.recipes import recipe_names
 from training.trainer import Trainer
 
 COCO = load_layout("coco17")
@@ -229,9 +232,9 @@ def test_bad_recipes_are_refused(override, message):
 
 def test_the_data_is_never_overwritten_by_the_model(data_file):
     before = data_file.read_bytes()
-    with pytest.raises(BagError, match="another output"):
+    with pytest.raises(OutputError, match="another output"):
         train(data_file, "-o", data_file, *SMALL)
-    with pytest.raises(BagError, match="another"):
+    with pytest.raises(OutputError, match="another"):
         train(data_file, "-o", data_file.with_name("m.npz"), "--json", data_file.with_name("m.npz"), *SMALL)
     assert data_file.read_bytes() == before
 
@@ -348,6 +351,6 @@ def test_doubtful_keypoints_of_a_bag_count_as_hidden_and_a_wild_one_spoils_nothi
 
 def test_an_output_that_cannot_be_written_stops_the_run_before_it_begins(data_file, tmp_path):
     (tmp_path / "folder.npz").mkdir()
-    with pytest.raises(BagError, match="folder"):
+    with pytest.raises(OutputError, match="folder"):
         train(data_file, "-o", tmp_path / "folder.npz", *SMALL)
     assert not (tmp_path / "folder.run").exists()

@@ -58,7 +58,7 @@ def _bag_keypoints(
         image_size: width and height in pixels, if known.
         rejections: is given the last reason for which messages of a topic were rejected.
     """
-    from paul_ros.offline.bag import matches, read_records
+    from paul_ros.offline.bag_reader import matches, read_records
 
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
     for record in read_records(path):
@@ -82,7 +82,7 @@ def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, 
     Cameras are read before the keypoints: some keypoints are shares of the image size, and the first of them may come
     before any CameraInfo.
     """
-    from paul_ros.offline.bag import read_records
+    from paul_ros.offline.bag_reader import read_records
 
     rejections: dict[str, str] = {}
     cameras: set[msg_adapters.Intrinsics] = set()

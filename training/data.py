@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from paul_ros.layout import Layout
-from paul_ros.model import centre
+from paul_ros.normalisation import centre
 
 DEFAULT_LAYOUT = "coco17"
 """Layout of 17 points and of bags, if none is named."""

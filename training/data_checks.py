@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from paul_ros.layout import Layout
-from paul_ros.model import centre, enough_visible, min_visible
+from paul_ros.normalisation import centre, enough_visible, min_visible
 from training.data import DEFAULT_LAYOUT, RawFrames, TrainingData, blocks
 from training.errors import DataError
 

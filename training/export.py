@@ -13,7 +13,7 @@ import torch
 import paul_ros
 from paul_ros.layout import Layout
 from paul_ros.metrics import procrustes
-from paul_ros.model import save_model
+from paul_ros.model_file import save_model
 from training.chirality import rule_share, same_side_share
 from training.data import TrainingData
 from training.networks import Paul

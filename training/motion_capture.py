@@ -14,8 +14,9 @@ from training.distributed import from_first
 from training.errors import DataError, MocapError
 from training.loading import load_training_data
 from training.options import TrainingOptions
-from training.people.human_data import check_outside, make_file, motion_files, views_of
-from training.people.mocap import human_layout
+from training.people.clips import motion_files
+from training.people.human_data import check_outside, make_file, views_of
+from training.people.human_points import human_layout
 from training.preflight import check_recipe
 from training.recipe import Recipe
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from paul_ros.layout import Layout
-from paul_ros.model import check_size
-from paul_ros.offline.bag import check_outputs
+from paul_ros.model_file import check_size
+from paul_ros.output_files import check_outputs
 from training.checkpoint import CHECKPOINT, LOG
 from training.errors import DataError, RecipeError, TrainingError
 from training.export import architecture

@@ -16,9 +16,10 @@ import numpy as np
 from benchmarks.fuzz.messages import BagMake, LiveMake, camera_info, cloud, depth_image, header, pose_array, random_pose
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model, weight_shapes
-from paul_ros.offline.bag import BagWriter
-from paul_ros.stream.stream import PACKED, LiftStream
+from paul_ros.model_file import load_model, weight_shapes
+from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.stream.messages import MessageBuilder
+from paul_ros.stream.stream import LiftStream
 
 
 class Bench:
@@ -31,7 +32,8 @@ class Bench:
         bag: factory of messages like those of bags.
         tiny: header and arrays of a small model.
         whole_bags: small bags, one a compression.
-        writers: serialised outputs, one writer each for all frames, as in a node.
+        objects: builder of outputs as message objects.
+        packed: builder of outputs as bytes; one for all frames, as in a node.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -40,8 +42,7 @@ class Bench:
         self.live, self.bag = LiveMake(), BagMake(foreign.DEFINITIONS)
         self.tiny = _tiny_model()
         self.whole_bags = [_tiny_bag(folder / f"{name}.mcap", self.bag, name) for name in ("none", "lz4", "zstd")]
-        factories: dict[str, Any] = PACKED
-        self.writers = {name: make() for name, make in factories.items()}
+        self.objects, self.packed = MessageBuilder(self.bag), MessageBuilder(self.bag, packed=True)
 
     def rewritten(self, message: Any, data: bytes) -> bytes:
         """Read and write a serialised message anew, because the value of padding is arbitrary."""

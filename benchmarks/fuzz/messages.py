@@ -13,7 +13,7 @@ import numpy as np
 
 from msg_adapters import outputs
 from paul_ros.layout import load_layout
-from paul_ros.offline.bag import BagMessages
+from paul_ros.offline.bag_records import BagMessages
 
 Pose = dict[str, tuple[float, float]]
 """Keypoint name -> pixel."""

@@ -27,10 +27,12 @@ from msg_adapters.cdr import CloudReader
 from paul_ros.errors import BagError, LayoutError, ModelError
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
-from paul_ros.model import load_model
-from paul_ros.offline.bag import BagWriter, read_records
-from paul_ros.offline.replay import Topics, evaluate, replay
-from paul_ros.stream.stream import PACKED, LiftStream
+from paul_ros.model_file import load_model
+from paul_ros.offline.bag_reader import read_records
+from paul_ros.offline.bag_writer import BagWriter
+from paul_ros.offline.judge import evaluate
+from paul_ros.offline.replay import Topics, replay
+from paul_ros.stream.stream import LiftStream
 
 SESSION = 25  # cases
 
@@ -86,9 +88,9 @@ def message_session(
                 stream.depth(msg)
             else:
                 topic = BODIES.format(rng.choice("abc")) if type_name == foreign.HRI else ""
-                frame = stream.keypoints(type_name, msg, topic)
+                answer = stream.keypoints(type_name, msg, topic)
                 sent += 1
-                publish(frame, stream, bench, rng)
+                publish(answer.frame, stream, bench, rng)
         except Exception:
             tally.crash(f"{where} {type_name} {kind}")
         _count_case(tally, stream, before, start, f"{where} {type_name} {kind}", strict)
@@ -101,7 +103,7 @@ def message_session(
 
 def drops(stream: LiftStream) -> Counter[str]:
     """Return a copy of the stream's drops: reason -> count."""
-    return Counter(stream.drops)
+    return Counter(stream.ledger.drops)
 
 
 def _count_case(tally: Tally, stream: LiftStream, before: Counter[str], start: float, where: str, strict: bool) -> None:
@@ -110,7 +112,7 @@ def _count_case(tally: Tally, stream: LiftStream, before: Counter[str], start: f
     tally.time(time.process_time() - start)
     new = drops(stream) - before
     if strict and new["internal_error"]:
-        tally.crash(f"{where} internal_error {stream.explanations['internal_error']}")
+        tally.crash(f"{where} internal_error {stream.ledger.advice['internal_error']}")
     tally.drops(new)
 
 
@@ -125,12 +127,10 @@ def publish(frame: Any, stream: LiftStream, bench: Bench, rng: random.Random) ->
     _check_finite(frame)
     if rng.random() < 0.1:
         with stream.guard():
-            for output, message in frame.messages(bench.bag).items():
+            packed = bench.packed.messages(frame)
+            for output, message in bench.objects.messages(frame).items():
                 data = bench.bag.serialise(message)
-                if (
-                    output in PACKED
-                    and bench.rewritten(message, frame.serialised(output, bench.writers[output])) != data
-                ):
+                if isinstance(packed[output], bytes) and bench.rewritten(message, packed[output]) != data:
                     raise WrongOutput(f"{output} differs between object and bytes")
 
 
@@ -177,7 +177,7 @@ def cdr_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, wher
         start, before = time.process_time(), drops(stream)
         try:
             _check_like_rosbags(bench, data, reader)
-            publish(stream.keypoints(foreign.CLOUD, data), stream, bench, rng)
+            publish(stream.keypoints(foreign.CLOUD, data).frame, stream, bench, rng)
         except Exception:
             tally.crash(where)
         _count_case(tally, stream, before, start, where, strict=True)

@@ -24,7 +24,7 @@ from paul_ros.errors import NodeBenchmarkError
 from paul_ros.offline.processes import need_ros, process, ros_environment, rss_mb, tail
 
 #: Name of a measured node -> its Python module.
-MODULES = {"lifter": "paul_ros.ros.node", "echo": "paul_ros.benchmarks.echo"}
+MODULES = {"lifter": "paul_ros.ros.lifter_process", "echo": "paul_ros.benchmarks.echo"}
 
 _PROBE_HZ = 100.0  # rate of the messages that wait for a node's first output
 _TIMEOUT = 30.0  # seconds for a process to answer

@@ -18,7 +18,7 @@ from paul_ros.benchmarks import rivals
 from paul_ros.benchmarks.naive import naive_optimum
 from paul_ros.benchmarks.onp_problems import SCENARIOS, SHAPE_SCENARIOS, Problems, Scenario, problems
 from paul_ros.extras import require
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 from paul_ros.versions import versions
 
 METHODS: dict[str, Callable] = {

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from paul_ros.model import Model, load_model
+from paul_ros.model import Model
+from paul_ros.model_file import load_model
 
 _POSE_VARIETY = 0.6  # noise of the views that human poses are made from, over the shape's standard deviation
 _HIDDEN_NOISE = 10.0  # standard deviation of hidden image points, over that of a shape coordinate

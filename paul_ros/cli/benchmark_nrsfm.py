@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> None:
     if args.plot:
         require("benchmark", "matplotlib")
     from training.judge import nrsfm
-    from training.judge.experiments import Keeping
+    from training.judge.experiments import SeriesOptions
 
     report = nrsfm.run(
         args.data,
@@ -83,6 +83,6 @@ def run(args: argparse.Namespace) -> None:
         seeds=args.seeds,
         hide=args.hide,
         settings=args.set,
-        keeping=Keeping(args.work, args.fresh, args.threads, args.quiet),
+        options=SeriesOptions(args.work, args.fresh, args.threads, args.quiet),
     )
     publish(report, nrsfm.table, args.json, (lambda: nrsfm.write_picture(args.plot, report)) if args.plot else None)

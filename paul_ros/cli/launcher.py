@@ -11,7 +11,7 @@ import sys
 from collections.abc import Collection
 
 from paul_ros import __version__
-from paul_ros.cli.options import Commands, HelpFormatter
+from paul_ros.cli.options import HelpFormatter
 
 COMMANDS = {
     "lift": "lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
@@ -99,22 +99,9 @@ def build_parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.Argument
     for name, line in COMMANDS.items():
         if name not in wanted:
             commands.add_parser(name, help=line)
-        elif name == "train":
-            _add_train(commands)
         else:
             importlib.import_module(f"paul_ros.cli.{name}").add_parser(commands)
     return parser
-
-
-def _add_train(commands: Commands) -> None:
-    parser = commands.add_parser("train", description="Learn a 3D shape model from 2D keypoints alone.")
-    from paul_ros.extras import require
-
-    require("train", "torch", "tqdm")
-    from training import command
-
-    command.add_arguments(parser)
-    parser.set_defaults(run=command.run)
 
 
 def _check_command(parser: argparse.ArgumentParser, argv: list[str]) -> None:

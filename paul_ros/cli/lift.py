@@ -115,9 +115,9 @@ def run(args: argparse.Namespace) -> None:
         PaulError: a file or a parameter cannot be used, or nobody could be lifted.
     """
     kinds = [_kind(args, path, name) for path, name in ((args.input, "IN"), (args.output, "OUT"))]
+    from paul_ros.errors import KeypointFileError
     from paul_ros.lifter import Lifter
-    from paul_ros.model import load_model
-    from paul_ros.offline.arrays import KeypointFileError
+    from paul_ros.model_file import load_model
     from paul_ros.stream.parameters import checked
 
     check_files([args.output], [args.input, args.model, args.layout, args.output_layout, args.camera])

@@ -23,7 +23,7 @@ def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | No
     Raises:
         BagError: names the file and what to do.
     """
-    from paul_ros.offline.bag import check_outputs
+    from paul_ros.output_files import check_outputs
 
     check_outputs([path for path in outputs if path != STDOUT], inputs)
 
@@ -47,7 +47,7 @@ def publish(
     """
     import json
 
-    from paul_ros.offline.report import write_json
+    from paul_ros.files import write_json
 
     to_stdout = json_file == STDOUT
     if json_file and not to_stdout:

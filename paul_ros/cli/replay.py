@@ -87,8 +87,10 @@ def run(args: argparse.Namespace) -> None:
         BagError: the bag is damaged (after all was written), or nobody could be lifted.
     """
     from paul_ros.errors import BagError
-    from paul_ros.offline.replay import Topics, evaluate, replay
-    from paul_ros.offline.report import table, write_picture
+    from paul_ros.offline.judge import evaluate
+    from paul_ros.offline.picture import write_picture
+    from paul_ros.offline.replay import Topics, replay
+    from paul_ros.offline.report import table
     from paul_ros.stream.stream import open_stream
 
     check_files([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
@@ -99,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
         done = replay(args.bag, stream, args.output, topics, lambda: count(1))
     report = evaluate(done)
     publish(report, table, args.json, (lambda: write_picture(args.plot, done)) if args.plot else None)
-    if not report["lifted"] and done.why_not:
-        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.why_not)}")
+    if not report["lifted"] and done.drop_advice:
+        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.drop_advice)}")
     if done.damage:
         raise done.damage

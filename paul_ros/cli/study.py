@@ -88,12 +88,12 @@ def run(args: argparse.Namespace) -> None:
     check_files([args.output / f"{args.study}.{kind}" for kind in ("json", "png")], args.data)
     require("benchmark", "matplotlib")
     require("train", "torch", "tqdm")
-    from training.judge.experiments import Keeping
-    from training.judge.studies import study
+    from training.judge.experiments import SeriesOptions
+    from training.judge.studies import registry, study
 
-    keeping = Keeping(args.output / "work", args.fresh, args.threads, args.quiet)
-    chosen = study.studies()[args.study]
-    print(study.run(chosen, args.data, args.output, args.seeds, tuple(args.values), args.set, keeping))
+    options = SeriesOptions(args.output / "work", args.fresh, args.threads, args.quiet)
+    chosen = registry.STUDIES[args.study]
+    print(study.run(chosen, args.data, args.output, args.seeds, tuple(args.values), args.set, options))
 
 
 def run_interpolation(args: argparse.Namespace) -> None:

@@ -64,8 +64,9 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         BagError: the bag is damaged; the film shows what lies before the damage.
     """
-    from paul_ros.model import load_model
-    from paul_ros.offline.film import view_bag, view_model
+    from paul_ros.model_file import load_model
+    from paul_ros.offline.film import view_bag
+    from paul_ros.offline.film_model import view_model
     from paul_ros.offline.replay import Topics
     from paul_ros.stream.stream import open_stream
 
@@ -78,6 +79,6 @@ def run(args: argparse.Namespace) -> None:
         film, damage = view_bag(thing, stream, output, topics, args.start, args.seconds, drawing)
     else:
         film = view_model(load_model(args.thing), output, drawing)
-    print(f"{film.path}: {film.said}")
+    print(f"{film.path}: {film.summary}")
     if damage:
         raise damage

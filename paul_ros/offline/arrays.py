@@ -11,10 +11,12 @@ import numpy as np
 
 from msg_adapters import Intrinsics
 from msg_adapters.keypoints import Keypoints2D, record
-from paul_ros.errors import LayoutError, PaulError
+from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout, layout_names, load_layout
-from paul_ros.lifter import Lifted, Lifter
-from paul_ros.stream.route import MODEL, PREFERRED, Route
+from paul_ros.lifted import Lifted
+from paul_ros.lifter import Lifter
+from paul_ros.route import MODEL, Route
+from paul_ros.stream.layout_search import PREFERRED
 
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 

@@ -67,7 +67,7 @@ class BagMessages:
             for name, text in definitions.items():
                 self._store.register(get_types_from_msg(text, name))
 
-    def __call__(self, type_name: str, **fields: Any) -> Any:
+    def __call__(self, type_name: str, /, **fields: Any) -> Any:
         return self._store.types[type_name](**fields)
 
     @staticmethod

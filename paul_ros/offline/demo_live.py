@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A live run of the node in three processes.
 
-This one records, `paul_ros.ros.node` lifts, `demo_player` plays.
+This one records, `paul_ros.ros.lifter_process` lifts, `demo_player` plays.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def run_live(bag: Path, recording: Path, model: str | None = None) -> Live:
     with tempfile.TemporaryFile() as log, BagWriter(recording) as writer, Recorder(environment, writer) as recorder:
         began = time.monotonic()
         parameters = ["-p", f"layout:={LAYOUT}", *(["-p", f"model:={model}"] if model else [])]
-        with process(["paul_ros.ros.node", "--ros-args", *parameters], environment, log) as node:
+        with process(["paul_ros.ros.lifter_process", "--ros-args", *parameters], environment, log) as node:
             recorder.spin_until(lambda: recorder.counts[f"{NODE_NAME}/layout"] > 0, node, log, _TIMEOUT)
             ready = time.monotonic() - began
             with process(["paul_ros.offline.demo_player", str(bag)], environment, log) as player:

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.lifter import AMBIGUOUS
+from paul_ros.lifted import AMBIGUOUS
 from paul_ros.offline.canvas import AMBER, CALM, CAPTION, INK, Canvas, draw_legend, show_box, turntable
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.skeleton_drawing import draw_skeleton
-from paul_ros.stream.stream import project
+from paul_ros.stream.messages import project
 
 _TURN = np.radians(3.0)  # of the turntable, a picture
 _FOLLOW_PICTURES = 15  # over which the turntable follows the persons

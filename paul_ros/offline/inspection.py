@@ -7,7 +7,7 @@ from pathlib import Path
 
 from paul_ros.errors import BagError
 from paul_ros.layout import Layout, layout_names, load_layout
-from paul_ros.model import load_model, model_names
+from paul_ros.model_file import load_model, model_names
 from paul_ros.offline.bag_reader import read_records
 
 

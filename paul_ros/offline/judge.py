@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from paul_ros import metrics
-from paul_ros.lifter import AMBIGUOUS, Lifted, Lifter
+from paul_ros.lifted import AMBIGUOUS, Lifted
+from paul_ros.lifter import Lifter
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.versions import versions
 
@@ -74,9 +75,9 @@ def evaluate(done: Replay) -> dict:
         "frames": stream.counts["frames"],
         "persons": stream.counts["persons"],
         "lifted": stream.counts["lifted"],
-        "dropped": dict(sorted(stream.drops.items())),
-        "noted": dict(sorted(stream.notes.items())),
-        "advice": dict(sorted(stream.explanations.items())),
+        "dropped": dict(sorted(stream.ledger.drops.items())),
+        "noted": dict(sorted(stream.ledger.notes.items())),
+        "advice": dict(sorted(stream.ledger.advice.items())),
         "units": stream.units,
         **error_measures(pairs_with_truth(done, done.frames), done.layout.root),
         "reprojection_median_px": _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),

@@ -11,10 +11,10 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from paul_ros.errors import LayoutError
+from paul_ros.errors import KeypointFileError, LayoutError
 from paul_ros.layout import Layout, layout_names, load_layout
-from paul_ros.offline.arrays import KeypointFileError, Persons
-from paul_ros.stream.route import PREFERRED
+from paul_ros.offline.arrays import Persons
+from paul_ros.stream.layout_search import PREFERRED
 
 _MAX_FRAME = 2**63  # of an int64
 _COLUMNS = "frame,keypoint,x,y and, if there are any, person and confidence"

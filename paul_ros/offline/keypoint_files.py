@@ -12,10 +12,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from paul_ros.errors import LayoutError, NpzError
+from paul_ros.errors import KeypointFileError, LayoutError, NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout
-from paul_ros.offline.arrays import KeypointFileError, Persons, layout_of
+from paul_ros.offline.arrays import Persons, layout_of
 from paul_ros.offline.keypoint_csv import read_csv
 
 BATCH = 4096

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 
 from paul_ros.layout import Layout
-from paul_ros.lifter import Lifted
+from paul_ros.lifted import Lifted
 from paul_ros.model import Model
 from paul_ros.offline.arrays import Persons
 

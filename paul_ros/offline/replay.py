@@ -16,16 +16,19 @@ from typing import Any
 import numpy as np
 
 import msg_adapters
-from msg_adapters import Intrinsics, Keypoints2D, MessageError
+from msg_adapters import Intrinsics, Keypoints2D
 from msg_adapters.keypoints import stamp_ns
 from paul_ros.errors import BagError, WrongTopicError
 from paul_ros.layout import Layout
-from paul_ros.lifter import Lifted
+from paul_ros.lifted import Lifted
 from paul_ros.offline.bag_reader import matches, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages, Record
 from paul_ros.offline.bag_writer import LATCHED_QOS, BagWriter
 from paul_ros.output_files import check_outputs
-from paul_ros.stream.stream import Frame, LiftStream
+from paul_ros.stream.frame import Frame
+from paul_ros.stream.messages import MessageBuilder
+from paul_ros.stream.reasons import REASONS
+from paul_ros.stream.stream import LiftStream
 
 #: Name of the replayed node; output topics lie below it, as those of the live node do.
 NODE_NAME = "/lifter"
@@ -112,7 +115,7 @@ class Replay:
     @property
     def drop_advice(self) -> list[str]:
         """Advice about dropped messages and persons, once for each reason."""
-        return [text for reason, text in self.stream.explanations.items() if self.stream.drops[reason]]
+        return [text for reason, text in self.stream.ledger.advice.items() if self.stream.ledger.drops[reason]]
 
 
 def replay(
@@ -169,6 +172,8 @@ class _OfflineNode:
         self.done, self.topics, self.writer = done, topics, writer
         self.keypoint_messages = 0
         self._make = BagMessages()
+        self._builder = MessageBuilder(self._make)
+        self._builder = MessageBuilder(self._make)
         self._described: dict = {}
         self._flat_truth: dict[int, np.ndarray] = {}  # stamp -> (N*P,3) in the input's layout
         self._last_time = 0
@@ -211,8 +216,7 @@ class _OfflineNode:
         try:
             message = record.message()
         except BagError as error:
-            with self.done.stream.guard():
-                raise MessageError("undecodable", str(error)) from error
+            self.done.stream.ledger.drop("undecodable", str(error))
         else:
             take(message)
 
@@ -222,9 +226,9 @@ class _OfflineNode:
         self._decode(record, "keypoints", lambda message: self._lift(record, message), *msg_adapters.SUPPORTED)
 
     def _lift(self, record: Record, message: Any) -> None:
-        frame = self.done.stream.keypoints(record.type_name, message, record.topic)
+        answer = self.done.stream.keypoints(record.type_name, message, record.topic)
         self._write_layout(record.log_time)
-        self._take_frame(frame)
+        self._take_frame(answer.frame)
 
     def _take_frame(self, frame: Frame | None) -> None:
         if frame is None:
@@ -233,7 +237,7 @@ class _OfflineNode:
         stamp = frame.keypoints.stamp
         self.done.frames.append(LiftedFrame(stamp, frame.keypoints, frame.lifted, frame.given, camera))
         if self.writer:
-            for name, message in frame.messages(self._make).items():
+            for name, message in self._builder.messages(frame).items():
                 self.writer.write(f"{NODE_NAME}/{name}", message, self._last_time)
 
     def _take_truth(self, message: Any) -> None:
@@ -245,7 +249,7 @@ class _OfflineNode:
         route = self.done.stream.route
         points = len(route.given.names)
         if len(flat) % points:
-            self.done.stream.drops["truth_wrong_point_count"] += 1
+            self.done.stream.ledger.drop("truth_wrong_point_count", REASONS["truth_wrong_point_count"].advice)
             return
         self.done.truth[stamp] = route.points_out(flat.reshape(-1, points, 3))
 

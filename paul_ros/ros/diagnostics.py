@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.lifter import AMBIGUOUS
+from paul_ros.lifted import AMBIGUOUS
 from paul_ros.stream.frame import Frame
 from paul_ros.stream.stream import LiftStream
 

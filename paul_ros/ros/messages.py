@@ -30,7 +30,7 @@ def message_class(type_name: str) -> Any:
 class RosMake:
     """The factory of `paul_ros.stream.messages` for rclpy's message classes."""
 
-    def __call__(self, type_name: str, **fields: Any) -> Any:
+    def __call__(self, type_name: str, /, **fields: Any) -> Any:
         """Build a message of a type from all its fields."""
         return message_class(type_name)(**fields)
 

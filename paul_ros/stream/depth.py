@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from msg_adapters import DepthImage, Intrinsics
-from paul_ros.lifter import Lifted
+from paul_ros.lifted import Lifted
 from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.reasons import REASONS
 

@@ -12,7 +12,7 @@ import numpy as np
 from msg_adapters import Intrinsics, Keypoints2D
 from paul_ros.body_axes import body_rotations, quaternions
 from paul_ros.layout import Layout
-from paul_ros.lifter import Lifted
+from paul_ros.lifted import Lifted
 
 
 @dataclass(frozen=True)

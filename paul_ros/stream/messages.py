@@ -6,27 +6,18 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from msg_adapters import Intrinsics, outputs
 from msg_adapters.cdr import CloudWriter, PoseArrayWriter
-from paul_ros.body_axes import Steady
+from msg_adapters.factory import MessageFactory
+from paul_ros.body_axes import ContinuousSigns
 from paul_ros.stream.frame import Frame
 
 Attitudes = Callable[[], np.ndarray]
 """Returns (N,4) quaternions of the body axes; not called by outputs that have no attitudes."""
-
-
-class Make(Protocol):
-    """A factory of message objects of one family: rclpy's classes or rosbags' dataclasses."""
-
-    def __call__(self, type_name: str, **fields: Any) -> Any:
-        """Build a message of a type such as 'std_msgs/msg/String' from all its fields."""
-
-    def octets(self, data: bytes) -> Any:
-        """Convert bytes to the value of a uint8[] field."""
 
 
 @dataclass(frozen=True)
@@ -58,40 +49,40 @@ class Output:
 
     name: str
     message_type: str
-    build: Callable[[Make, Frame, Attitudes], Any]
+    build: Callable[[MessageFactory, Frame, Attitudes], Any]
     topic: str
     packed: Packed | None = None
     optional: bool = False
     parameter: str = ""
 
 
-def _poses(make: Make, frame: Frame, _: Attitudes) -> Any:
+def _poses(make: MessageFactory, frame: Frame, _: Attitudes) -> Any:
     return outputs.pose_array(make, frame.header, _lifted_points(frame))
 
 
-def _bodies(make: Make, frame: Frame, attitudes: Attitudes) -> Any:
+def _bodies(make: MessageFactory, frame: Frame, attitudes: Attitudes) -> Any:
     ok = frame.lifted.ok
     return outputs.body_array(make, frame.header, frame.lifted.root[ok], attitudes()[ok])
 
 
-def _keypoints3d(make: Make, frame: Frame, _: Attitudes) -> Any:
+def _keypoints3d(make: MessageFactory, frame: Frame, _: Attitudes) -> Any:
     return outputs.points_cloud(make, frame.header, *_point_columns(frame))
 
 
-def _markers(make: Make, frame: Frame, _: Attitudes) -> Any:
+def _markers(make: MessageFactory, frame: Frame, _: Attitudes) -> Any:
     ok, layout = frame.lifted.ok, frame.layout
     points, visible = frame.lifted.points[ok], frame.keypoints.visible[ok]
     return outputs.skeleton_markers(make, frame.header, points, visible, layout.edges, layout.sides, frame.bone_width)
 
 
-def _transforms(make: Make, frame: Frame, attitudes: Attitudes) -> Any:
+def _transforms(make: MessageFactory, frame: Frame, attitudes: Attitudes) -> Any:
     # Frames are in metres (REP-103), so persons in model units have none.
     metric = frame.metric
     ids = [ident for ident, good in zip(frame.keypoints.ids, metric) if good]
     return outputs.body_transforms(make, frame.header, ids, frame.lifted.root[metric], attitudes()[metric])
 
 
-def _annotations(make: Make, frame: Frame, _: Attitudes) -> Any:
+def _annotations(make: MessageFactory, frame: Frame, _: Attitudes) -> Any:
     metric, layout = frame.metric, frame.layout
     pixels = project(frame.lifted.points[metric], frame.camera)
     visible = frame.keypoints.visible[metric]
@@ -155,7 +146,7 @@ class MessageBuilder:
     """
 
     def __init__(
-        self, make: Make, packed: bool = False, convert_header: Callable[[Any], Any] = lambda header: header
+        self, make: MessageFactory, packed: bool = False, convert_header: Callable[[Any], Any] = lambda header: header
     ) -> None:
         """Make a builder.
 
@@ -166,7 +157,7 @@ class MessageBuilder:
         """
         self._make = make
         self._convert_header = convert_header
-        self._continuous_signs = Steady()
+        self._continuous_signs = ContinuousSigns()
         self._writers = {
             name: (output.packed.writer(), output.packed.values)
             for name, output in OUTPUTS.items()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from paul_ros.lifter import MAX_DISTANCE
+from paul_ros.lifted import MAX_DISTANCE
 
 DROP = "drop"
 """Kind: a whole message was not used."""

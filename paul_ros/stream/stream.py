@@ -23,8 +23,10 @@ from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPoi
 from msg_adapters.cdr import CloudReader
 from paul_ros.body_axes import left_and_up
 from paul_ros.layout import Layout, load_layout
-from paul_ros.lifter import Lifted, Lifter
-from paul_ros.model import load_model
+from paul_ros.lifted import Lifted
+from paul_ros.lifter import Lifter
+from paul_ros.model_file import load_model
+from paul_ros.route import MODEL, Route
 from paul_ros.stream import advice
 from paul_ros.stream.depth import SURFACE
 from paul_ros.stream.frame import Frame
@@ -32,7 +34,6 @@ from paul_ros.stream.layout_search import read_in_fitting_layout
 from paul_ros.stream.parameters import checked
 from paul_ros.stream.person_group import PersonGroup
 from paul_ros.stream.reasons import REASONS
-from paul_ros.stream.route import MODEL, Route
 from paul_ros.stream.session import Session
 from paul_ros.stream.smoothing import OneEuro
 

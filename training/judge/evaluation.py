@@ -15,9 +15,10 @@ import numpy as np
 
 from paul_ros.errors import ModelError, NpzError
 from paul_ros.files import read_npz
-from paul_ros.lifter import AMBIGUOUS, TOO_FEW_POINTS
-from paul_ros.model import Model, load_model
-from paul_ros.offline.replay import versions
+from paul_ros.lifted import AMBIGUOUS, TOO_FEW_POINTS
+from paul_ros.model import Model
+from paul_ros.model_file import load_model
+from paul_ros.versions import versions
 from training.categories import among_categories
 from training.errors import DataError
 from training.judge.comparison import Comparison, errors

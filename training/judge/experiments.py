@@ -16,7 +16,6 @@ import io
 import json
 import re
 import shutil
-import sys
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +36,7 @@ from training.judge.comparison import errors_of_signs
 from training.judge.prediction import MIN_POINTS
 from training.judge.truth import Sequence
 from training.loading import load_training_data
+from training.progress import Progress, progress_bar
 from training.recipe import Recipe
 from training.reconstruction import Reconstruction
 from training.start.kept_start import START, start_identity
@@ -151,12 +151,8 @@ def perform(experiments: list[Experiment], options: SeriesOptions) -> list[Outco
         shutil.rmtree(options.work / _STARTS, ignore_errors=True)
     torch.set_num_threads(options.threads)
     outcomes = []
-    # A log file gets two lines a minute.
-    interval = 0.1 if sys.stderr.isatty() else 30.0
     layout = "{percentage:3.0f}%|{bar:20}| {n:.2f} of {total} runs [{elapsed}, {remaining} left] {desc}"
-    with tqdm(
-        total=len(experiments), disable=options.quiet, bar_format=layout, mininterval=interval, dynamic_ncols=True
-    ) as bar:
+    with progress_bar(options.quiet, total=len(experiments), bar_format=layout) as bar:
         for number, (experiment, folder) in enumerate(zip(experiments, folders)):
             detail = f" {experiment.detail}" if experiment.detail else ""
             name = f"{experiment.sequence.name} {Path(experiment.method).stem}{detail}"
@@ -182,7 +178,7 @@ def _move(bar: tqdm, to: float) -> None:
     bar.update(max(0.0, to - bar.n))
 
 
-def _perform(experiment: Experiment, folder: Path, fresh: bool, progress: Callable[[float], None]) -> Outcome:
+def _perform(experiment: Experiment, folder: Path, fresh: bool, progress: Progress) -> Outcome:
     """Train an experiment unless its reconstruction is kept, and judge it."""
     kept = folder / "shapes.npz"
     if fresh:

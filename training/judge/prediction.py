@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 
 from paul_ros import metrics
-from paul_ros.lifter import DEGENERATE_POINTS, TOO_FEW_POINTS
+from paul_ros.lifted import DEGENERATE_POINTS, TOO_FEW_POINTS
 from paul_ros.model import Model
-from paul_ros.onp import onp
+from paul_ros.orthographic_n_point import onp
 
 MIN_POINTS = 4
 """Visible points that a frame must have to be judged: three points fit nearly any shape."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,13 @@ from training.errors import MocapError
 from training.people.asf_amc import AsfSkeleton, read_amc, read_asf
 from training.people.bvh import read_bvh
 from training.people.mocap import CMU31, check_size
+from training.progress import Progress, ignore_progress
 
 Clip = tuple[str, np.ndarray]
 """Name of a trial, and its joints (F,31,3) in metres, y up, order ``CMU31``."""
 
 
-def read_clips(folder: Path, progress: Callable[[float], object] = lambda share: None) -> list[Clip]:
+def read_clips(folder: Path, progress: Progress = ignore_progress) -> list[Clip]:
     """Read every clip in the folder and the folders below it.
 
     Args:

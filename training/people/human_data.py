@@ -13,28 +13,27 @@ The trainer reads the 2D file only.  The 3D truth of the same frames goes to ano
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
 import io
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from paul_ros.errors import NpzError, PaulError
 from paul_ros.files import read_npz, write_atomically
 from paul_ros.normalisation import enough_visible
-from paul_ros.offline.bag import check_outputs
-from training.errors import MocapError, RecipeError
+from paul_ros.output_files import check_outputs
+from training.errors import MocapError, RecipeError, ViewsError
 from training.people.clips import Clip, read_clips, require_motion_files
 from training.people.human_points import human_layout, human_points
 from training.people.poses import HELD_OUT, distinct_frames, other_people, training_clips
 from training.people.simulated_views import simulate_views
 from training.people.view_settings import ViewSettings
+from training.progress import Progress, ignore_progress, share_bar
 from training.recipe import Recipe
 
 FORMAT = 1
@@ -48,7 +47,7 @@ _BLOCK = 4096
 
 
 def make(
-    clips: list[Clip], views: ViewSettings, progress: Callable[[float], object] = lambda share: None
+    clips: list[Clip], views: ViewSettings, progress: Progress = ignore_progress
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Make the arrays of the training file, and those of a file of the same frames with their truth.
 
@@ -116,13 +115,13 @@ def make_file(folder: Path, views: ViewSettings, path: Path, truth: Path | None 
     made = {"format": FORMAT, "files": _digest(folder), "views": views.to_dict()}
     if truth is None and _made_of(path) == made:
         return
-    with _progress_bar("motion capture", quiet) as progress:
+    with share_bar(quiet, "motion capture") as progress:
         clips = training_clips(read_clips(folder, progress))
     if not clips:
         raise MocapError(
             f"'{folder}' holds only trials that are kept for evaluation ({', '.join(HELD_OUT)}): add others"
         )
-    with _progress_bar("views", quiet) as progress:
+    with share_bar(quiet, "views") as progress:
         arrays, judged = make(clips, views, progress)
     about = {**json.loads(arrays["about"].tobytes()), **made}
     arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
@@ -160,15 +159,6 @@ def _made_of(path: Path) -> dict[str, Any] | None:
         return None
 
 
-@contextlib.contextmanager
-def _progress_bar(description: str, quiet: bool) -> Iterator[Callable[[float], object]]:
-    """Show a progress bar; yields a function that takes the share of the work that is done."""
-    layout = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}"
-    interval = 0.1 if sys.stderr.isatty() else 30.0
-    with tqdm(total=1.0, desc=description, disable=quiet, mininterval=interval, bar_format=layout) as bar:
-        yield lambda done: bar.update(done - bar.n)
-
-
 def _save(path: Path, arrays: dict[str, Any]) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
@@ -179,11 +169,14 @@ def views_of(recipe: Recipe) -> ViewSettings:
     """Return the recipe's settings of views.
 
     Raises:
-        RecipeError: it has none.
+        RecipeError: it has none, or they cannot be used.
     """
     if recipe.views is None:
         raise RecipeError("a folder of motion capture needs a recipe with settings of views: --recipe human")
-    return recipe.views
+    try:
+        return ViewSettings.from_dict(recipe.views)
+    except ViewsError as error:
+        raise RecipeError(str(error)) from None
 
 
 def check_outside(folder: Path, outputs: Iterable[Path | None]) -> None:

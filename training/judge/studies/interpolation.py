@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from paul_ros.files import write_json
 from paul_ros.model import Model
 from paul_ros.model_file import load_model
 from paul_ros.normalisation import normalise
-from paul_ros.offline.replay import versions
-from paul_ros.offline.report import write_json
 from paul_ros.orthographic_n_point import onp
+from paul_ros.versions import versions
 from training.categories import among_categories
 from training.errors import DataError
 from training.judge.pictures import blue_to_red, draw_shape, frame_panels, new_figure, save_figure, turned_view

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from paul_ros.offline.replay import versions
-from paul_ros.offline.report import write_json
+from paul_ros.files import write_json
+from paul_ros.versions import versions
 from training.errors import DataError, RecipeError
 from training.judge.experiments import Experiment, Outcome, SeriesOptions, perform
 from training.judge.pictures import save_figure
