@@ -158,7 +158,7 @@ def paul_parser() -> argparse.ArgumentParser:
     """Return the parser of `paul`, with the options of all commands, those of `train` too."""
     from paul_ros.cli import launcher
 
-    return launcher._parser(["train"])
+    return launcher.build_parser()
 
 
 def _commands(parser: argparse.ArgumentParser, name: str) -> Iterator[str]:
