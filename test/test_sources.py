@@ -12,7 +12,7 @@ import pytest
 from tiny_data import sequence
 
 from paul_ros.model import load_model, save_model
-from training.recipe import Recipe
+from training.recipe import Recipe, recipe_names
 from training.sources import DataKind, kind_of
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -58,7 +58,7 @@ SMALL = "start=random regression_steps=0 steps=2 width=8 batch=8 bottleneck=3".s
 
 @pytest.mark.parametrize("data, missing", [("views.npz", "mcap,rosbags"), (BAG, "matplotlib")])
 def test_other_data_than_motion_capture_needs_none_of_its_modules(tmp_path, data, missing):
-    """And arrays need none of the packages that read bags."""
+    """Arrays need none of the packages that read bags, either."""
     np.savez(tmp_path / "views.npz", W=sequence()[0].W)
     settings = [word for item in SMALL for word in ("--set", item)]
     out = run(TRAIN, missing, "train", tmp_path / data, "-o", tmp_path / "m.npz", *settings, "--quiet")
@@ -75,7 +75,7 @@ parser = argparse.ArgumentParser()
 add_arguments(parser)
 print(parser.format_help())
 """
-    assert "one of adl, adl_low_rank, default, human" in " ".join(run(code).split())
+    assert f"one of {', '.join(recipe_names())}, or a YAML file" in " ".join(run(code).split())
 
 
 def test_training_without_torch_says_what_to_install(tmp_path):
