@@ -227,6 +227,11 @@ def test_bad_recipes_are_refused(override, message):
         Recipe.load("default", [override])
 
 
+def test_settings_without_effect_are_noted(data_file, tmp_path, capsys):
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", "views.views=2")
+    assert "note: settings of views are not used: they are for a folder of motion capture" in capsys.readouterr().err
+
+
 def test_the_data_is_never_overwritten_by_the_model(data_file):
     before = data_file.read_bytes()
     with pytest.raises(BagError, match="another output"):
