@@ -34,7 +34,7 @@ def one_thread():
 
 
 def write(path, points, frames=20, seed=0, **more):
-    """Turned views of one random body of so many points."""
+    """Write turned views of one random body."""
     rng = np.random.default_rng(seed)
     S = Rotation.random(frames, random_state=seed).as_matrix() @ rng.standard_normal((3, points))
     np.savez(path, W=(100 * S[:, :2] + 300).astype(np.float32), **more)
@@ -125,8 +125,8 @@ def test_files_that_do_not_go_together_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("scale", ["free", "unit"])
-def test_what_other_categories_have_costs_nothing(garage, scale):
-    """Points of the buses may be anywhere in a car's frame, in both streams; its own points, seen or not, may not."""
+def test_points_of_other_categories_cost_nothing(garage, scale):
+    """Points of the bus may be anywhere in a frame of the car, in both streams; the car's own points may not."""
     data = load_files(garage)
     recipe = Recipe.from_dict({"bottleneck": 3, "hidden": [8], "width": 8, "scale": scale})
     torch.manual_seed(0)
@@ -135,7 +135,7 @@ def test_what_other_categories_have_costs_nothing(garage, scale):
     visible[:, 6] = False
     views = NormalisedViews.of(W, visible, torch.ones(20, 1, 1), False, data.image_unit if scale == "unit" else None)
     weights = networks.decoder[-1].weight.data.view(3, 90, -1)
-    networks.shape_encoder[0].weight.data.view(-1, 3, 90)[:, :, 7:] = 0  # else f_e tells one stream of every point
+    networks.shape_encoder[0].weight.data.view(-1, 3, 90)[:, :, 7:] = 0  # else f_e passes every point to one stream
 
     def losses():
         with torch.no_grad():

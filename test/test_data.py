@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What may be trained on, and what is refused in one clear line."""
+"""Data that may be trained on, and data that is refused in one clear line."""
 
 import hashlib
 
@@ -91,7 +91,7 @@ def test_points_never_visible_are_noted_and_no_twins(tmp_path):
 
 
 def test_frames_on_one_line_are_left_out(tmp_path):
-    """Seen to rounding: in single precision a line is one only nearly."""
+    """In single precision points lie on a line only up to rounding."""
     W = views().astype(np.float32)
     W[2, 1] = 0.7 * W[2, 0] + 1000
     W[4, :, 1:] = W[4, :, :1] + np.float32(0.01) * views()[4, :, 1:]  # small, and no line
@@ -106,7 +106,7 @@ def test_points_taken_for_a_persons_are_noted(tmp_path):
 
 
 def test_detections_go_with_their_frames(tmp_path):
-    """Where a point is not marked it is not detected; frames of which too little is detected are left out."""
+    """Points that are not marked are not detected; frames with too few detections are left out."""
     W = views()
     detected = W + 1
     detected[1, :, :6] = np.nan
@@ -120,11 +120,11 @@ def test_detections_go_with_their_frames(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "detected, told",
+    "detected, message",
     [(views(points=8), "detected in .* must be numbers"), (views() * 1e5, "beyond 1e"), (np.array("x"), "be numbers")],
 )
-def test_bad_detections_are_refused(tmp_path, detected, told):
-    with pytest.raises(DataError, match=told):
+def test_bad_detections_are_refused(tmp_path, detected, message):
+    with pytest.raises(DataError, match=message):
         load(tmp_path, W=views(), detected=detected)
 
 
@@ -134,7 +134,7 @@ def test_too_little_for_any_shape_is_noted(tmp_path, frames, points):
     assert note.startswith(f"{frames} frames of {points} points leave the depth open")
 
 
-def test_a_wild_point_is_refused_where_all_frames_have_one_scale(tmp_path):
+def test_an_outlier_is_refused_if_all_frames_have_one_scale(tmp_path):
     W = views() / 100
     W[3, 0, 4] = 1e5
     data = load(tmp_path, W=W)
@@ -165,7 +165,7 @@ def test_layouts_are_guessed_by_the_number_of_points(tmp_path):
 
 @settings(deadline=None, max_examples=30)
 @given(st.integers(2, 40), st.integers(3, 12), st.floats(0, 0.5), st.integers(0, 99))
-def test_what_is_loaded_is_what_was_given(tmp_path_factory, frames, points, hidden, seed):
+def test_loaded_data_equals_given_data(tmp_path_factory, frames, points, hidden, seed):
     rng = np.random.default_rng(seed)
     W, visible = views(frames, points, seed), rng.random((frames, points)) >= hidden
     keeps = enough_visible(visible, load_layout(f"points{points}"))
@@ -181,7 +181,7 @@ def test_what_is_loaded_is_what_was_given(tmp_path_factory, frames, points, hidd
 
 
 def test_the_digest_is_that_of_the_bytes(tmp_path):
-    """A checkpoint of an earlier version knows its data still."""
+    """Checkpoints of earlier versions still match their data."""
     data = load(tmp_path, W=views())
     digest = hashlib.sha256(data.W.tobytes())
     digest.update(np.packbits(data.visible).tobytes())
@@ -203,7 +203,7 @@ def test_the_image_unit_is_the_rms_coordinate(tmp_path, monkeypatch, block):
 
 
 def rays() -> np.ndarray:
-    """(F,2,17) what all those bags show, as the camera that is in them sees it."""
+    """Rays (F,2,17) of all those bags, by the camera in them."""
     xy = PIXELS.reshape(-1, 17, 2)
     return centred_view(xy, np.ones(xy.shape[:2], bool), read_camera_info(camera_info(Factory()))).W
 
@@ -253,7 +253,7 @@ def test_cameras_of_two_sizes_are_refused(tmp_path):
         load_training_data(write_shares(tmp_path / "in.mcap", camera_info(Factory()), other), topic=BODIES)
 
 
-def test_of_several_bodies_one_or_all_must_be_chosen(tmp_path):
+def test_a_bag_with_several_bodies_needs_a_choice(tmp_path):
     bag = write(tmp_path / "in.mcap", "hri")
     with pytest.raises(DataError, match="/humans/bodies/anna/skeleton2d, /humans/bodies/ben/.*--topic"):
         load_training_data(bag)

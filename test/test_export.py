@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a finished run becomes: sizes, mirror images and memory of the model file."""
+"""The model file of a finished run: sizes, mirror images and memory."""
 
 from types import SimpleNamespace
 
@@ -62,8 +62,8 @@ def test_the_file_gives_the_shapes_that_were_trained(data, tmp_path, scale, enco
     assert (np.ptp(sizes) > 1e-3) == (scale == "unit")
 
 
-def test_the_misfit_is_told_in_model_units(data, tmp_path):
-    """Of the median distance between points and where the model puts them, whatever the frames' scales."""
+def test_the_misfit_is_in_model_units(data, tmp_path):
+    """It follows from the median distance of points from the model's points, at any scale of the frames."""
     header = export_model(trained(data, tmp_path), 0.5, tmp_path / "m.npz", "paul train")
     model = load_model(tmp_path / "m.npz")
     assert model.misfit == header["misfit"]
@@ -123,7 +123,7 @@ def test_the_mean_of_dense_shapes_is_taken_of_fewer(data, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("mirrored", [0, 7, 20])
-def test_shapes_are_told_from_mirror_images_of_their_mean(mirrored):
+def test_shapes_are_distinguished_from_mirror_images_of_their_mean(mirrored):
     rng = np.random.default_rng(0)
     mean = rng.standard_normal((3, 9))
     mean -= mean.mean(1, keepdims=True)

@@ -40,7 +40,7 @@ def model_of(seen, bases=BASES, seed=1):
 
 
 def images(seen, V, R):
-    """What a frame's camera makes of the bases (F,K+1,3,P), centred on the visible points, 0 at the others."""
+    """Bases as the frames' cameras see them (F,K+1,3,P), centred on the visible points, 0 at the others."""
     shown = seen.visible[:, None, None].double()
     turned = torch.einsum("fai,kip->fkap", R, V)
     return (turned - (turned * shown).sum(3, keepdim=True) / shown.sum(3, keepdim=True)) * shown
@@ -49,8 +49,8 @@ def images(seen, V, R):
 def dense(seen, V, R, sigma):
     """By matrices (2P,2P): likelihoods (F,), with and without the cameras integrated out; means, covariances of codes.
 
-    W is Gaussian about the mean's image with covariance C = B B^T + sigma^2 I; hidden points and the translation,
-    which the images say nothing of, are left out of the constants.
+    W is Gaussian about the mean's image with covariance C = B B^T + sigma^2 I. The constants leave out hidden points
+    and the translation, which the images do not determine.
     """
     M = images(seen, V, R)
     size, K = 2 * seen.points, len(V) - 1
@@ -97,7 +97,7 @@ def test_marginal_likelihood_and_its_gradient_are_those_of_the_dense_gaussian(hi
 
 @HIDDEN
 def test_points_on_one_line_have_a_marginal_likelihood(hidden):
-    # They tell no turn about it: rounding made the determinant of what they tell negative.
+    # They leave the turn about it open; rounding made the determinant negative.
     rng = np.random.default_rng(0)
     along = rng.standard_normal((4, 1, POINTS)) * np.array([3.0, 4.0, 5.0])[:, None]
     R = random_rotations(200, rng)
@@ -152,7 +152,7 @@ def test_no_other_camera_has_a_higher_expected_likelihood(hidden):
 
 
 def objective(model, seen, sigma, penalty):
-    """What expectation maximisation lowers: no Laplace term."""
+    """Expectation maximisation lowers the likelihood without the Laplace term."""
     return float(model.posterior(seen, sigma).nll.mean() + penalty * model.V.square().sum() / (3 * seen.points))
 
 
@@ -214,7 +214,7 @@ def test_new_bases_are_small_and_change_no_shape():
     assert 0 < wide.V[BASES + 1 :].abs().max() < 0.1
 
 
-def test_what_is_hidden_is_not_looked_at_and_frames_are_centred_on_the_rest():
+def test_hidden_points_are_ignored_and_frames_are_centred_on_the_rest():
     rng = np.random.default_rng(0)
     W, visible = rng.standard_normal((4, 2, 6)), np.arange(6) < 4
     visible = np.tile(visible, (4, 1))

@@ -57,7 +57,7 @@ def saved(path, paul, recipe, layout=COCO, **changes):
 
 
 def shaken(paul):
-    """Thresholds and biases away from their zeros, so that leaving one out is seen."""
+    """Thresholds and biases that differ from zero, so that a missing one shows."""
     with torch.no_grad():
         for weight in paul.parameters():
             weight.add_(0.1 * torch.randn_like(weight))
@@ -238,7 +238,7 @@ def test_upright_views_are_the_same_however_they_were_turned_or_mirrored(seed, h
     other = turned(W, rng.uniform(-4, 4, len(W)), rng.random(len(W)) < 0.5)
     found = upright(W, axes)
     np.testing.assert_allclose(upright(other, axes), found, atol=1e-9)
-    # Turned rigidly, to where they are said to be.
+    # Turned rigidly, to the stated place.
     np.testing.assert_allclose(found.swapaxes(1, 2) @ found, W.swapaxes(1, 2) @ W, atol=1e-9)
     first, second = (found @ axes.T).transpose(2, 0, 1)
     np.testing.assert_allclose(first[:, 0], 0, atol=1e-9)
@@ -290,7 +290,7 @@ def test_main_axes_are_the_longest_sums_of_points():
 
 
 def test_every_category_has_main_axes_of_its_own():
-    """With those of all points a view of the smaller object would have no direction."""
+    """With axes of all points a view of the smaller object would have no direction."""
     names = [f"p{i}" for i in range(11)]
     parts = {"a": names[::2], "b": names[1::2]}
     layout = Layout.from_dict({"name": "two", "names": names, "root": names, "categories": parts})
@@ -331,6 +331,6 @@ def test_gradients_of_the_layers_against_finite_differences():
     assert torch.autograd.gradcheck(encoder, S)
 
 
-def test_what_is_no_number_stays_none():
+def test_nan_stays_nan():
     decoder = networks()[0].decoder
     assert decoder(torch.full((1, 3), torch.nan)).isnan().all()

@@ -115,7 +115,7 @@ def test_projections_of_normalised_shapes_are_centred_where_the_image_is():
 @pytest.mark.parametrize("solver", ["exact", "algebraic"])
 @pytest.mark.parametrize("streams", ["both", "decoder"])
 def test_gradients_are_those_of_the_loss(scale, solver, streams):
-    """Of cameras and depths too: by differences, with points hidden."""
+    """Gradients include those of cameras and depths; compared with differences, with points hidden."""
     recipe = replace(PAPER, scale=scale, solver=solver, streams=streams, nuclear_weight=0.01)
     networks, layout, views = case(0.3, recipe)
     weight = networks.decoder[0].weight
@@ -150,7 +150,7 @@ def test_the_nuclear_norm_is_that_of_the_batch_of_shapes():
 
 
 def test_the_default_weights_are_the_earlier_ones_times_the_root_of_17():
-    """Before, distances were divided by the root of the number of points: training for 17 points is the same."""
+    """Distances were once divided by the root of the number of points; training for 17 points is the same."""
     recipe = Recipe()
     networks = build_networks(COCO, recipe, 8)
     W = torch.from_numpy(100 * coco_model().mean_shape[None, :2] + np.random.default_rng(0).normal(0, 9, (8, 2, 17)))
@@ -227,7 +227,7 @@ def test_bone_variation_is_zero_for_one_body_in_any_orientation():
     assert bone_variation(turned * torch.linspace(1, 2, 5)[:, None, None], COCO) > 0.01
 
 
-def test_lopsided_bodies_are_told_from_symmetric_ones():
+def test_lopsided_bodies_cost_more_than_symmetric_ones():
     S = torch.from_numpy(coco_model().mean_shape).double()[None]
     symmetric = (S + S[:, :, COCO.mirror] * torch.tensor([-1.0, 1.0, 1.0])[:, None]) / 2
     lopsided = symmetric.clone()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of the training frames themselves: what is observed stays, restarts are ranked, files are checked."""
+"""Shapes of the training frames: observed points stay, restarts are ranked, files are checked."""
 
 import json
 import sys
@@ -72,7 +72,7 @@ def test_observed_points_stay_and_the_rest_is_in_their_unit(codes, scale):
 @pytest.mark.parametrize("scale", ["unit", "free"])
 @pytest.mark.parametrize("codes", ["free", "encoder"])
 def test_a_rigid_body_is_reconstructed_from_a_good_start(monkeypatch, codes, scale):
-    """Regression and objective keep a start that is right: no sign or axis is lost on the way."""
+    """Regression and objective keep a correct start: no sign or axis is lost."""
     given = sequence(bend=0.0)
     monkeypatch.setattr(starting, "search", search_for(*given))
     settings = {"regression_steps": 300, "steps": 50, "codes": codes, "scale": scale, "learning_rate": 6e-3}
@@ -105,7 +105,7 @@ def test_a_start_of_some_frames_is_no_reconstruction(monkeypatch):
     assert reconstruct(given[0], Recipe.from_dict(STARTED)).shapes.shape == given[1].shape
 
 
-def test_a_wild_point_is_told_before_the_first_step(tmp_path, file):
+def test_an_outlier_is_refused_before_the_first_step(tmp_path, file):
     data = sequence()[0]
     data.W[7, 0, 2] = 1e5
     with pytest.raises(DataError, match="frame 7 of made up .* by point p02"):
@@ -149,9 +149,9 @@ def test_frames_in_parts_are_those_at_once(tmp_path, monkeypatch):
 def test_progress_rises_to_one(monkeypatch):
     given = sequence()
     monkeypatch.setattr(starting, "search", search_for(*given))
-    told = []
-    reconstruct(given[0], Recipe.from_dict({**STARTED, "restarts": 2}), progress=told.append)
-    assert told == sorted(told) and told[0] > 0 and told[-1] == 1 and 0.5 in told
+    shares = []
+    reconstruct(given[0], Recipe.from_dict({**STARTED, "restarts": 2}), progress=shares.append)
+    assert shares == sorted(shares) and shares[0] > 0 and shares[-1] == 1 and 0.5 in shares
 
 
 def test_a_saved_reconstruction_is_read_again(tmp_path):
@@ -175,7 +175,7 @@ NO_RECONSTRUCTION = {
 
 
 @pytest.mark.parametrize("case", NO_RECONSTRUCTION)
-def test_what_is_no_reconstruction_is_refused(tmp_path, case):
+def test_files_without_a_reconstruction_are_refused(tmp_path, case):
     contents, message = NO_RECONSTRUCTION[case]
     path = tmp_path / "x.npz"
     if contents:
@@ -339,7 +339,7 @@ def test_a_start_that_cannot_be_read_is_no_divergence(tmp_path, monkeypatch):
         reconstruct(given[0], Recipe.from_dict({**STARTED, "restarts": 2}), tmp_path)
 
 
-def test_what_is_printed_of_losses_and_fits_has_its_name_and_unit(file, tmp_path, monkeypatch, capsys):
+def test_printed_losses_and_fits_have_a_name_and_a_unit(file, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(starting, "search", search_for(*sequence()))
     words = [file, "--shapes", tmp_path / "s.npz", *AS_OPTIONS]
     train(*words, "--set", "start=linear", "--set", "steps=0")

@@ -127,7 +127,7 @@ def test_streams_are_solved_to_a_lower_cost_than_any_other_pose(step):
 
 @pytest.mark.parametrize("solver", ["exact", "algebraic"])
 def test_gradient_of_the_lower_level_cost_against_finite_differences(step, solver):
-    """The exact pose is a constant to autograd, and the gradient of the cost right all the same: envelope theorem."""
+    """Autograd sees the exact pose as a constant, and the gradient of the cost is right: envelope theorem."""
     S_ae, S_ad, W, visible = streams()
     solve = step.SOLVERS[solver]
 

@@ -171,7 +171,7 @@ def test_one_mirror_image_agrees_and_random_ones_half():
 
 
 @pytest.mark.parametrize("kind", ["planar", "collinear", "point"])
-def test_what_is_its_own_mirror_image_agrees(kind):
+def test_shapes_equal_to_their_mirror_image_agree(kind):
     X, _ = poses()
     R = torch.from_numpy(Rotation.random(len(X), random_state=3).as_matrix())
     X[:, {"planar": 2, "collinear": 1, "point": 0}[kind] :] = 0
@@ -196,7 +196,7 @@ def test_a_fitted_model_sees_its_shapes():
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_mirrored_cluster_is_flipped_back(seed):
-    """Neighbours agree within each of two kinds of poses: only all shapes together can tell."""
+    """Neighbours agree within each of two kinds of poses: only all shapes together show the mixture."""
     X, mode = poses(modes=2, seed=seed)
     mixed = flip(X, mode == 1)
     assert agreeing_share(mixed) > 0.9 and right_share(mixed, X) == 0.5
@@ -207,7 +207,7 @@ def test_a_mirrored_cluster_is_flipped_back(seed):
 
 
 def test_energy_outside_is_what_principal_directions_leave():
-    """Of many frames by the points' products and of few by the frames'; none is left by as many as there are frames."""
+    """Many frames use the points' products, few the frames'; as many directions as frames leave none."""
     for frames in (80, 12):
         X, _ = poses(frames=frames)
         together, _ = aligned(X)
@@ -218,7 +218,7 @@ def test_energy_outside_is_what_principal_directions_leave():
     assert energy_outside(X, 12) == pytest.approx(0, abs=1e-9)
 
 
-def test_what_is_right_stays():
+def test_a_correct_model_stays():
     X, _ = poses(modes=2)
     assert right_share(flipped(X, 3, 4, generator()), X) == 1.0
 
@@ -228,10 +228,10 @@ def test_random_signs_are_made_one():
     wrong = torch.from_numpy(np.random.default_rng(1).random(80) < 0.4)
     model = fitted(flip(X, wrong), seen(X), 6, ())
     before = model.in_camera(seen(X), 0.03)
-    told = []
-    found = synchronised(model, seen(X), generator(), told.append)
+    shares = []
+    found = synchronised(model, seen(X), generator(), shares.append)
     assert right_share(before, X) < 0.8 and right_share(found.in_camera(seen(X), 0.03), X) > 0.97
-    assert len(found.V) == len(model.V) and told == sorted(told) and 0 < told[-1] <= 1
+    assert len(found.V) == len(model.V) and shares == sorted(shares) and 0 < shares[-1] <= 1
 
 
 def test_a_round_that_makes_the_views_less_likely_is_taken_back(monkeypatch):
@@ -252,7 +252,7 @@ def test_a_model_of_one_mirror_image_is_left_alone():
 
 
 def test_hidden_points_do_not_hide_that_frames_agree():
-    """Shapes centred on what each frame happens to show would differ by their offsets."""
+    """Shapes centred on the points that each frame shows would differ by their offsets."""
     X, _ = poses(frames=80)
     visible = np.random.default_rng(2).random((80, 10)) < 0.6
     visible[:, :4] = True
@@ -270,7 +270,7 @@ def test_few_frames_and_points(frames, points):
 
 
 @pytest.mark.parametrize("kind", ["planar", "collinear", "same", "noise"])
-def test_what_fixes_no_sign_is_no_crash(kind):
+def test_shapes_without_a_sign_do_not_crash(kind):
     X, _ = poses(frames=20, points=6)
     rng = generator()
     if kind == "planar":

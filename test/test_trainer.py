@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: its phases, what it keeps, and that any interruption leaves no trace in the weights."""
+"""The training loop: its phases and files, and interruptions that leave no trace in the weights."""
 
 import signal
 from dataclasses import replace
@@ -204,14 +204,14 @@ def test_a_mirrored_start_explains_the_same_views():
 
 
 def lesson_of(data, start, scale="unit", calibrated=False):
-    """What a start of these frames teaches."""
+    """The lesson of a start of these frames."""
     W, visible, facing = torch.from_numpy(data.W), torch.from_numpy(data.visible), torch.ones(len(data.W), 1, 1)
     views = NormalisedViews.of(W, visible, facing, calibrated, data.image_unit if scale == "unit" else None)
     return Lesson.of(start, views, data.layout, scale)
 
 
 def test_a_shape_seen_by_its_own_camera_is_its_view():
-    """In the image's own units: a detector's errors are added to it."""
+    """It is in image units, for a detector's errors are added to it."""
     data, camera, R = sequence(layout=COCO)
     lesson, own = lesson_of(data, true_start(data, camera, R)), torch.arange(40)
     W = lesson.seen_by(own, lesson.shapes_of(own, None)).numpy()
@@ -219,7 +219,7 @@ def test_a_shape_seen_by_its_own_camera_is_its_view():
 
 
 def test_where_there_is_perspective_a_shape_is_seen_with_it():
-    """From the distances of the frames: what is nearer looks larger by their ratio."""
+    """Distances are those of the frames: nearer points look larger by their ratio."""
     data, camera, R = sequence(layout=COCO)
     S, distance = camera / 50, np.linspace(20, 60, 40)[:, None, None]
     rays = (S[:, :2] / (distance + S[:, 2:])).astype(np.float32)
@@ -235,7 +235,7 @@ def test_where_there_is_perspective_a_shape_is_seen_with_it():
 
 
 def test_views_of_held_solutions_have_the_detectors_errors(tmp_path, searches):
-    """Most of them: some are as the points were marked, for so the lower level sees them.  Nothing else has any."""
+    """Most of them have: some are as marked, as the lower level sees them.  Nothing else has errors."""
     data = sequence()[0]
     detected = data.W + 7
     detected[:, :, 0] = np.nan
@@ -277,7 +277,7 @@ def test_a_mirrored_object_has_a_mirrored_shape(tmp_path):
 
 
 def test_a_symmetric_object_mirrored_is_itself():
-    """And keeps its chirality and its place in the canonical frame."""
+    """It keeps its chirality and its place in the canonical frame."""
     S = np.random.default_rng(0).standard_normal((3, 17))
     S = S + np.diag([-1, 1, 1]) @ S[:, COCO.mirror]
     S = Rotation.random(random_state=0).as_matrix() @ (S - S.mean(1, keepdims=True))
@@ -344,7 +344,7 @@ def test_the_auto_decoder_trains_no_shape_encoder(tmp_path):
 
 
 def test_ctrl_c_waits_for_the_step(tmp_path, monkeypatch):
-    """It comes between the weights of a step, and the run continues as if it had not."""
+    """It comes in the middle of a step, and the run continues as if it had not."""
     data, recipe = sequence()[0], Recipe.from_dict({**FREE, "steps": 6})
     whole = through(Trainer(data, recipe, tmp_path / "whole"))
     first = Trainer(data, recipe, tmp_path / "parts")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""benchmarks/trainer_speed.py: the plain twin computes what the trainer computes, or the ratio would mean nothing."""
+"""benchmarks/trainer_speed.py: trainer and plain twin compute the same, without which the ratio means nothing."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def train(*arguments):
 
 
 def test_only_2d_reaches_the_trainer(data_file, tmp_path, monkeypatch):
-    """Twice: no other array of the file is opened, and without the truth the weights are the same to the bit."""
+    """No other array of the file is opened, and the weights do not depend on the truth, to the bit."""
     opened = []
     original = np.lib.npyio.NpzFile.__getitem__
     monkeypatch.setattr(
@@ -230,6 +230,11 @@ def test_bad_recipes_are_refused(override, message):
         Recipe.load("default", [override])
 
 
+def test_settings_without_effect_are_noted(data_file, tmp_path, capsys):
+    train(data_file, "-o", tmp_path / "m.npz", *SMALL, "--set", "views.views=2")
+    assert "note: settings of views are not used: they are for a folder of motion capture" in capsys.readouterr().err
+
+
 def test_the_data_is_never_overwritten_by_the_model(data_file):
     before = data_file.read_bytes()
     with pytest.raises(OutputError, match="another output"):
@@ -320,8 +325,8 @@ def test_a_bag_in_another_layout_says_which_would_fit(tmp_path):
         load_training_data(BAG, load_layout("body25"))
 
 
-def test_of_several_topics_one_must_be_chosen(tmp_path):
-    """The truth in our bags is a PoseArray too, but in 3D; a second topic of 2D keypoints leaves a choice."""
+def test_a_bag_with_several_topics_needs_a_choice(tmp_path):
+    """The truth in our bags is a PoseArray as well, but in 3D; a second topic of 2D keypoints leaves a choice."""
     with BagWriter(tmp_path / "two.mcap") as out:
         for record in read_records(BAG, {"/keypoints"}):
             out.write_record(record)
@@ -332,7 +337,7 @@ def test_of_several_topics_one_must_be_chosen(tmp_path):
     assert not data.calibrated and np.abs(data.W).max() > 100
 
 
-def test_doubtful_keypoints_of_a_bag_count_as_hidden_and_a_wild_one_spoils_nothing(tmp_path):
+def test_keypoints_of_low_confidence_are_hidden_and_an_outlier_spoils_nothing(tmp_path):
     make = BagMessages()
     rng = np.random.default_rng(0)
     xy = rng.uniform(300, 600, (20, 1, 17, 2))

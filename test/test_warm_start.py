@@ -37,12 +37,12 @@ HASTY = {
     "_CANDIDATE": ((0.1, 0.03, 1, 4), (0.03, 0.0, 1, 4)),
     "_DETAIL": ((0.03, 4), (0.002, 8)),
 }
-"""Where all that is asked is that there be a start: every step is taken, down to the least noise."""
+"""For tests that only need some start: every step is taken, down to the least noise."""
 
 
 @pytest.fixture(autouse=True)
 def few_starts(monkeypatch):
-    """A tenth of a second instead of a minute: what is made up here is easy."""
+    """A tenth of a second instead of a minute, which suffices for these easy sequences."""
     torch.set_num_threads(1)
     patch(monkeypatch, warm_start, EASY)
     patch(monkeypatch, linear_model, {"_REFINEMENTS": 2})
@@ -95,7 +95,7 @@ def error(start, S, visible):
 
 
 def check(start, rows, points):
-    """What holds of every start."""
+    """Check the properties of every start."""
     assert len(start.rows) == len(start.shapes) == len(start.rotations) == rows
     assert (np.diff(start.rows) > 0).all()
     assert start.shapes.shape == (rows, 3, points) and np.isfinite(start.shapes).all() and np.isfinite(start.score)
@@ -124,10 +124,10 @@ def test_shapes_are_found_up_to_one_mirror_from_2d_alone(share):
 
 def test_one_seed_gives_one_start_and_the_progress_grows_to_one(hasty):
     _, W = body(12, 6)
-    told = []
-    first, second = (linear_start(W, shown(W), 3, told.append) for _ in range(2))
+    shares = []
+    first, second = (linear_start(W, shown(W), 3, shares.append) for _ in range(2))
     assert all(np.array_equal(one, other) for one, other in zip(vars(first).values(), vars(second).values()))
-    half = told[: len(told) // 2]
+    half = shares[: len(shares) // 2]
     assert half == sorted(half) and half[-1] == 1.0 and half[0] > 0
 
 
@@ -184,7 +184,7 @@ def test_few_frames_and_few_points_have_some_start(frames, points, hasty):
 
 
 def degenerate(kind):
-    """Image points of which no shape follows; some are all on one line, or always the same."""
+    """Image points that determine no shape; some are on one line, or always the same."""
     rng = np.random.default_rng(0)
     V = rng.standard_normal((3, 3, 8)) * [[[1.0]], [[0.3]], [[0.3]]]
     code, R = np.c_[np.ones(20), rng.standard_normal((20, 2))], Rotation.random(20, random_state=0).as_matrix()
@@ -213,7 +213,7 @@ def degenerate(kind):
 @pytest.mark.parametrize(
     "kind", ["planar", "collinear", "rigid", "twins", "still camera", "still", "noise", "point", "outlier"]
 )
-def test_what_fixes_no_shape_is_no_crash(kind, hasty):
+def test_degenerate_views_do_not_crash(kind, hasty):
     W = degenerate(kind)
     visible = shown(W, 0.7)
     visible[:, -1] = False
@@ -231,7 +231,7 @@ def test_frames_with_too_few_points_are_left_out(hasty):
     assert not {3, 7} & set(start.rows)
 
 
-def test_too_few_frames_are_told():
+def test_too_few_frames_are_refused():
     _, W = body(5, 6)
     visible = shown(W)
     visible[1:] = False
@@ -240,7 +240,7 @@ def test_too_few_frames_are_told():
 
 
 @pytest.mark.parametrize("find", [linear_start, rigid_start])
-def test_numbers_that_no_matrix_bears_are_told(find):
+def test_infinite_numbers_are_refused(find):
     _, W = body(20, 6)
     with pytest.raises(StartError, match="broke down.*start: random"):
         find(np.where(np.arange(6) == 2, np.inf, W), shown(W), 0)

@@ -30,7 +30,7 @@ def sequence(frames=40, seed=0, hidden=0.0, bend=0.2, layout=None):
 
 
 def true_start(data, camera, R):
-    """What a perfect search would find where all views have one scale."""
+    """Return the start that a perfect search finds if all views have one scale."""
     S = np.swapaxes(R, 1, 2) @ camera / data.image_unit
     return Start(np.arange(len(S)), S.astype(np.float32), R, -1.0, 2.5)
 

@@ -15,7 +15,9 @@ class Frames:
     """Image points of all training frames as tensors, normalised as the recipe says.
 
     Attributes:
-        W: (F,2,P) image points; visible: (F,P) bool; detected: (F,2,P) or None, as in ``TrainingData``.
+        W: (F,2,P) image points, as in ``TrainingData``.
+        visible: (F,P) bool.
+        detected: (F,2,P) points of a detector, or None.
         layout: of the points.
         device: of the tensors.
     """

@@ -14,10 +14,8 @@ from typing import Any
 import yaml
 
 from paul_ros.layout import Layout
-from paul_ros.viewing_goal import Scale
-from training import recipes
+from paul_ros.viewing_sphere import Scale
 from training.errors import RecipeError
-from training.recipes import recipe_names
 
 CHOICES = {
     "codes": ("encoder", "free"),
@@ -209,9 +207,15 @@ class Recipe:
         return plain
 
 
+def recipe_names() -> list[str]:
+    """Return the names of the shipped recipes."""
+    folder = resources.files("training") / "recipes"
+    return sorted(item.name[:-5] for item in folder.iterdir() if item.name.endswith(".yaml"))
+
+
 def _read(name_or_path: str | Path) -> dict[str, Any]:
     text = str(name_or_path)
-    path = resources.files(recipes) / f"{text}.yaml" if text in recipe_names() else Path(text)
+    path = resources.files("training") / "recipes" / f"{text}.yaml" if text in recipe_names() else Path(text)
     if not path.is_file():
         raise RecipeError(f"no recipe '{text}': neither a file nor one of {', '.join(recipe_names())}")
     settings = _parsed(path.read_bytes(), f"recipe '{text}'") or {}

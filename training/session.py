@@ -49,7 +49,7 @@ def train(options: TrainingOptions) -> None:
     device = training_device(options.device)
     with joined(device):
         data, recipe = load_data(options, recipe, device)
-        data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe)))
+        data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe, options)))
         if options.fresh and is_first():
             _delete_runs(folders)
         _introduce(data)
@@ -80,10 +80,14 @@ def training_device(name: str) -> torch.device:
     return device
 
 
-def _unused(data: TrainingData, recipe: Recipe) -> tuple[str, ...]:
-    if data.detected is None or recipe.hold:
-        return ()
-    return ("its detected points are not used: h learns to read them only with held solutions (setting hold)",)
+def _unused(data: TrainingData, recipe: Recipe, options: TrainingOptions) -> tuple[str, ...]:
+    """Return a note for each input that has no effect."""
+    notes = []
+    if data.detected is not None and not recipe.hold:
+        notes.append("its detected points are not used: h learns to read them only with held solutions (setting hold)")
+    if recipe.views is None and any(override.startswith("views.") for override in options.overrides):
+        notes.append("settings of views are not used: they are for a folder of motion capture")
+    return tuple(notes)
 
 
 def _delete_runs(folders: list[Path]) -> None:

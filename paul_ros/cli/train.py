@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import sys
 from pathlib import Path
 
@@ -114,9 +115,7 @@ def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_training_arguments(parser: argparse.ArgumentParser) -> None:
-    from training.recipes import recipe_names
-
-    names = ", ".join(recipe_names())
+    names = ", ".join(_recipe_names())
     parser.add_argument("--recipe", default="default", help=f"one of {names}, or a YAML file (default: %(default)s)")
     parser.add_argument(
         "--set", metavar="KEY=VALUE", action="append", default=[], help="override a setting of the recipe"
@@ -135,6 +134,13 @@ def _add_training_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="CPU threads; the networks are small, so more gain little, and lose much on a busy machine (default: 1)",
     )
+
+
+def _recipe_names() -> list[str]:
+    """Return the names of the shipped recipes, by their files: `paul` builds this parser for every command."""
+    spec = importlib.util.find_spec("training")
+    folders = spec.submodule_search_locations if spec else None
+    return sorted(path.stem for folder in folders or () for path in Path(folder, "recipes").glob("*.yaml"))
 
 
 def _share(text: str) -> float:
