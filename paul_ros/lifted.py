@@ -18,6 +18,10 @@ BEHIND_CAMERA = "behind_camera"
 AMBIGUOUS = 0.9
 """From this ambiguity on, the depth-reversed pose explains the image nearly as well."""
 
+UNLIKE_MODEL = 0.5
+"""Unexplained share above which a person is hardly a shape of the model. Persons in the bags reach 0.37, with noise of
+5 % of the height 0.42. If COCO's points are taken for Human3.6M's or the reverse, 97 % of the persons exceed 0.5."""
+
 MIN_EXTENT = 1.0
 """Pixels, rms distance of the visible points from their mean: a smaller image cannot show a pose."""
 

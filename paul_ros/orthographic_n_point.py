@@ -4,8 +4,9 @@
 The function ``onp`` minimises ``sum_j w_j |s R_xy S_j + t - W_j|^2`` over rotations R, translations t and, in the
 free-scale problem, s > 0.
 
-The page ``docs/explanation/onp.md`` reduces this to a smooth function on the sphere of viewing directions and derives the
-proof of global optimality.  The module ``paul_ros.viewing_sphere`` has the solver; ``paul benchmark onp`` measures it.
+The page ``docs/explanation/onp.md`` reduces this to a smooth function on the sphere of viewing directions.  It also
+derives the proof of global optimality.  The module ``paul_ros.viewing_sphere`` has the solver, and
+``paul benchmark onp`` measures it.
 """
 
 from __future__ import annotations

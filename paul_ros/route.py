@@ -8,12 +8,13 @@ model, and the model completes them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from msg_adapters.keypoints import Keypoints2D
 from paul_ros.errors import LayoutError
-from paul_ros.layout import Layout, Mapping
+from paul_ros.layout import Layout, Mapping, load_layout
 from paul_ros.lifted import Lifted
 
 MODEL = "model"
@@ -75,6 +76,24 @@ class Route:
     def points_out(self, points: np.ndarray) -> np.ndarray:
         """Map 3D points (N,P,3) of the input's layout to (N,Q,3) of the output's; NaN where the input lacks them."""
         return self.out.values(self.into.values(points))
+
+
+def find_output_layout(name_or_path: str | Path | None, model: Layout) -> Layout | None:
+    """Find the layout that an output is asked for in.
+
+    Args:
+        name_or_path: name or path of a layout, ``model`` for the model's own, or empty for the default.
+        model: layout of the model.
+
+    Returns:
+        The layout, or None for the default of ``Route.between``.
+
+    Raises:
+        LayoutError: there is no such layout, or it is malformed.
+    """
+    if not name_or_path:
+        return None
+    return model if name_or_path == MODEL else load_layout(name_or_path)
 
 
 def missing(model: Layout, target: Layout) -> list[str]:

@@ -2,8 +2,8 @@
 """Orthographic-N-point, reduced to the viewing direction n and solved on the sphere of directions.
 
 The module ``paul_ros.viewing_goal`` has the goal g(n) and the climb.  The best pose that looks along n is
-``r1 + i r2 = u z/|z|``, and the best n has the largest g.  The page ``docs/explanation/onp.md`` derives this and proves the
-certificate.
+``r1 + i r2 = u z/|z|``, and the best n has the largest g.  The page ``docs/explanation/onp.md`` derives this
+and proves the certificate.
 """
 
 from __future__ import annotations

@@ -48,6 +48,8 @@ import pytest
 from foreign_messages import DEFINITIONS
 
 ROOT = Path(__file__).resolve().parent.parent
+#: The command of the node's process.
+LIFTER = [sys.executable, "-m", "paul_ros.ros.lifter_process"]
 _VENV = ROOT / ".venv"
 #: Whether this Python is the one that the Makefile sets up.
 IN_VENV = _VENV.exists() and os.path.samefile(sys.prefix, _VENV)
@@ -62,7 +64,7 @@ MARKERS = {
 }
 #: Packages that a robot may lack. Test modules that import a missing one are not collected.
 OPTIONAL = ("torch", "rosbags", "mcap", "matplotlib", "rich", "tqdm", "scipy", "hypothesis", "catkin_pkg")
-#: Imported late by paul_ros.offline.bag.
+#: Imported late by paul_ros.offline.bag_records.
 BAGS = {"rosbags", "mcap"}
 MISSING = {package for package in OPTIONAL if importlib.util.find_spec(package) is None}
 
@@ -71,7 +73,7 @@ MISSING = {package for package in OPTIONAL if importlib.util.find_spec(package) 
 def packages_of(module: str) -> set[str]:
     """Return the foreign packages that a test module needs, itself or through others."""
     reached = import_graph.reached([module])
-    return {name.partition(".")[0] for name in reached} | (BAGS if "paul_ros.offline.bag" in reached else set())
+    return {name.partition(".")[0] for name in reached} | (BAGS if "paul_ros.offline.bag_records" in reached else set())
 
 
 _FILES = sorted(Path(__file__).parent.glob("test_*.py"))
@@ -302,15 +304,7 @@ class LifterProcess:
         env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
         with open(self._log, "wb") as log:
             self.process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "paul_ros.ros.lifter_process",
-                    "--ros-args",
-                    "-r",
-                    f"__ns:=/{namespace}",
-                    *ros_args,
-                ],
+                [*LIFTER, "--ros-args", "-r", f"__ns:=/{namespace}", *ros_args],
                 cwd=ROOT,
                 env=env,
                 stdout=log,

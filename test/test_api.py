@@ -44,10 +44,12 @@ WITHOUT_EXAMPLES = [
     "paul_ros.lifted",
     "paul_ros.model_file",
     "paul_ros.normalisation",
+    "paul_ros.output_files",
     "paul_ros.pinhole_pose",
     "paul_ros.placement",
     "paul_ros.route",
     "paul_ros.shape_fit",
+    "paul_ros.versions",
     "paul_ros.viewing_goal",
     "paul_ros.viewing_sphere",
 ]

@@ -27,8 +27,7 @@ from paul_ros.stream.stream import open_stream
 from training.errors import DataError, RecipeError, TrainingError
 from training.export import mean_shape, metres_per_unit
 from training.loading import load_training_data
-from training.recipe import Recipe
-from training.recipes import recipe_names
+from training.recipe import Recipe, recipe_names
 from training.trainer import Trainer
 
 COCO = load_layout("coco17")

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from paul_ros.layout import Layout
-from paul_ros.viewing_sphere import Scale
+from paul_ros.viewing_goal import Scale
 from training.errors import RecipeError
 
 CHOICES = {

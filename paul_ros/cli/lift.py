@@ -24,7 +24,6 @@ FORMATS = ("npz", "csv", "json")
 
 _LIFTED = ""  # the reason of a lifted person
 _UNLIKE = "unlike_the_model"
-_UNLIKE_SHARE = 0.5  # of a person is not explained; the stream notes such persons too
 _DESCRIPTION = """\
 Lift arrays of 2D keypoints to 3D, each person alone, as the ROS 2 node does. No ROS is needed.
 The points are in metres from the camera if a camera is given, otherwise in model units from each person's root.
@@ -137,9 +136,10 @@ def _lift(
 ) -> str:
     """Lift from file to file; count persons in `tally` by reason. Return the line for the user."""
     from paul_ros.layout import load_layout
-    from paul_ros.offline.arrays import lift_persons, route_of
+    from paul_ros.offline.arrays import lift_persons
     from paul_ros.offline.keypoint_files import open_keypoints
     from paul_ros.offline.lifted_files import LiftedFile
+    from paul_ros.route import Route, find_output_layout
 
     camera, model = _camera(args), lifter.model
     units = "m" if camera and lifter.metres_per_unit else "model"
@@ -147,7 +147,8 @@ def _lift(
         layout = load_layout(args.layout) if args.layout else None
         name = "standard input" if args.input == STDOUT else str(args.input)
         keypoints = open_keypoints(file, name, kinds[0], layout, model.layout)
-        route = route_of(keypoints.layout, model.layout, args.output_layout)
+        output = find_output_layout(args.output_layout, model.layout)
+        route = Route.between(keypoints.layout, model.layout, output)
         lifted = lift_persons(keypoints.batches, lifter, route, camera, min_confidence)
         with open_output(args.output) as out, progress("lift", "person", keypoints.persons) as count:
             LiftedFile(route.output, model, units).write(out, kinds[1], _counted(lifted, tally, count))
@@ -156,9 +157,11 @@ def _lift(
 
 def _counted(batches: Batches, tally: Counter[str], count: Callable[[int], None]) -> Batches:
     """Yield the batches while their persons are counted by the reason why they were not lifted."""
+    from paul_ros.lifted import UNLIKE_MODEL
+
     for persons, lifted in batches:
         tally.update(lifted.reason)
-        tally[_UNLIKE] += int((lifted.unexplained > _UNLIKE_SHARE).sum())
+        tally[_UNLIKE] += int((lifted.unexplained > UNLIKE_MODEL).sum())
         yield persons, lifted
         count(len(lifted.reason))
 

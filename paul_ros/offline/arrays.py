@@ -12,11 +12,11 @@ import numpy as np
 from msg_adapters import Intrinsics
 from msg_adapters.keypoints import Keypoints2D, record
 from paul_ros.errors import LayoutError
-from paul_ros.layout import Layout, layout_names, load_layout
+from paul_ros.layout import Layout
 from paul_ros.lifted import Lifted
 from paul_ros.lifter import Lifter
-from paul_ros.route import MODEL, Route
-from paul_ros.stream.layout_search import PREFERRED
+from paul_ros.route import Route
+from paul_ros.stream.layout_search import candidates
 
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 
@@ -70,32 +70,15 @@ class Persons:
 def layout_of(points: int, model: Layout) -> Layout:
     """Return the layout that the node would take for this number of keypoints, if nobody names one.
 
-    It is the model's own, or else the first shipped layout that maps onto the model, in the order of PREFERRED.
+    It is the first of `layout_search.candidates` with as many points.
 
     Raises:
         LayoutError: no layout fits.
     """
-    shipped = (load_layout(name) for name in dict.fromkeys([*PREFERRED, *layout_names()]))
-    for layout in (model, *shipped):
-        if len(layout.names) == points and _maps(layout, model):
+    for layout in candidates(model):
+        if len(layout.names) == points:
             return layout
     raise LayoutError(f"no shipped layout of {points} keypoints fits model layout '{model.name}': set --layout")
-
-
-def route_of(given: Layout, model: Layout, output: str | None) -> Route:
-    """Return the mappings from the input's layout to the model's and on to the output's.
-
-    Args:
-        given: layout of the input.
-        model: layout of the model.
-        output: name or path of the output's layout, `model`, or None for the node's default.
-
-    Raises:
-        LayoutError: the layouts have too few points in common.
-    """
-    if not output:
-        return Route.between(given, model)
-    return Route.between(given, model, model if output == MODEL else load_layout(output))
 
 
 def lift_persons(
@@ -116,12 +99,4 @@ def lift_persons(
     for batch in batches:
         keypoints = Keypoints2D(batch.xy, batch.confidence, batch.visible, batch.person, 0, "")
         seen = route.keypoints_in(keypoints, min_confidence)
-        yield batch, route.lifted_out(lifter.lift(seen.xy, seen.visible, camera))
-
-
-def _maps(layout: Layout, model: Layout) -> bool:
-    try:
-        layout.map_to(model)
-    except LayoutError:
-        return False
-    return True
+        yield batch, route.lifted_out(lifter.lift_in_model_layout(seen.xy, seen.visible, camera))

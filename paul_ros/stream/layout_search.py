@@ -19,8 +19,7 @@ PREFERRED = ("coco17", "h36m17", "openpose18", "body25", "mediapipe33")
 def read_in_fitting_layout(model: Layout, type_name: str, msg: Any, source: Source) -> tuple[Keypoints2D, Layout]:
     """Read a message in the layout that fits it best.
 
-    The candidates, in order: the layout whose points the message names, the model's own, and the shipped layouts in the
-    order of PREFERRED. All but the model's must map onto the model. The first with the right number of points is taken.
+    The first of `candidates` with the right number of points is taken.
 
     Returns:
         The keypoints and the layout in which they were read.
@@ -30,7 +29,7 @@ def read_in_fitting_layout(model: Layout, type_name: str, msg: Any, source: Sour
         MessageError: as `msg_adapters.read`.
     """
     refusal: WrongPointCount | None = None
-    for layout in _candidates(model, msg_adapters.named_layout(type_name, msg)):
+    for layout in candidates(model, msg_adapters.named_layout(type_name, msg)):
         try:
             return msg_adapters.read(type_name, msg, len(layout.names), replace(source, names=layout.names)), layout
         except WrongPointCount as error:
@@ -39,7 +38,16 @@ def read_in_fitting_layout(model: Layout, type_name: str, msg: Any, source: Sour
     raise refusal
 
 
-def _candidates(model: Layout, named: str | None) -> list[Layout]:
+def candidates(model: Layout, named: str | None = None) -> list[Layout]:
+    """Return the layouts that an input may have, the best first.
+
+    They are the named one, the model's own, and the shipped layouts in the order of PREFERRED. All but the model's map
+    onto the model.
+
+    Args:
+        model: layout of the model.
+        named: name of the layout whose points a message names; None if it names none.
+    """
     fitting = {layout.name: layout for layout in _shipped() if _maps(layout, model)}
     first = [fitting[named]] if named in fitting else []
     return [*first, model, *fitting.values()]

@@ -23,10 +23,10 @@ from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPoi
 from msg_adapters.cdr import CloudReader
 from paul_ros.body_axes import left_and_up
 from paul_ros.layout import Layout, load_layout
-from paul_ros.lifted import Lifted
+from paul_ros.lifted import UNLIKE_MODEL, Lifted
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
-from paul_ros.route import MODEL, Route
+from paul_ros.route import Route, find_output_layout
 from paul_ros.stream import advice
 from paul_ros.stream.depth import SURFACE
 from paul_ros.stream.frame import Frame
@@ -39,10 +39,6 @@ from paul_ros.stream.smoothing import OneEuro
 
 _BONE_WIDTH = 0.01
 """Width of a drawn bone over the mean shape's largest extent."""
-
-_UNLIKE = 0.5
-"""Unexplained share of a person above which it is noted. Persons in the bags reach 0.37, with noise of 5 % of the
-height 0.42. If COCO's points are taken for Human3.6M's or the reverse, 97 % of the persons exceed 0.5."""
 
 _log = logging.getLogger(__name__)
 
@@ -89,13 +85,12 @@ def open_stream(
     given = {"model": model, "layout": layout, **parameters}
     values = checked({name: value for name, value in given.items() if value is not None})
     loaded = load_model(values["model"])
-    output = values["output_layout"]
     return LiftStream(
         Lifter(loaded, values["person_height"]),
         load_layout(values["layout"]) if values["layout"] else None,
         values["min_confidence"],
         values["max_persons"],
-        loaded.layout if output == MODEL else load_layout(output) if output else None,
+        find_output_layout(values["output_layout"], loaded.layout),
         values["smoothing"],
         session,
     )
@@ -327,7 +322,7 @@ class LiftStream:
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:
         start = time.perf_counter_ns()
-        lifted = self.lifter.lift(keypoints.xy, keypoints.visible, self.intrinsics)
+        lifted = self.lifter.lift_in_model_layout(keypoints.xy, keypoints.visible, self.intrinsics)
         if keypoints.persons:
             self.lift_us.append((time.perf_counter_ns() - start) / 1000)
         return lifted
@@ -337,7 +332,7 @@ class LiftStream:
         self.counts.update(frames=1, persons=given.persons, lifted=int(lifted.ok.sum()))
         for reason in filter(None, lifted.reason):
             self.ledger.drop(f"person_{reason}", REASONS[f"person_{reason}"].advice)
-        if unlike := int((lifted.unexplained > _UNLIKE).sum()):
+        if unlike := int((lifted.unexplained > UNLIKE_MODEL).sum()):
             text = advice.unlike_the_model(self.lifter.model.name, self.route.given.name)
             self.ledger.note("unlike_the_model", text, unlike)
 
