@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 import tempfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from paul_ros.errors import NpzError
 
 _NAMED = 5  # most arrays that an error names
+_NAMELESS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk, which name no file
 
 
 def read_npz(
@@ -48,8 +52,9 @@ def read_npz(
     return arrays
 
 
-def write_atomically(path: str | os.PathLike, data: bytes) -> None:
-    """Write a file that is complete or unchanged; missing folders are made.
+@contextlib.contextmanager
+def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
+    """Open a file for writing that is complete or unchanged when the block ends; missing folders are made.
 
     Raises:
         OSError: the file cannot be written.  The error names the file, also if the disk is full.
@@ -59,14 +64,26 @@ def write_atomically(path: str | os.PathLike, data: bytes) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(data)
+            yield file
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException as error:
         os.unlink(temporary)
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.errno in _NAMELESS:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
+
+
+def write_atomically(path: str | os.PathLike, data: bytes) -> None:
+    """Write a file that is complete or unchanged; see `atomic_file`."""
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+def write_npz(path: str | os.PathLike, arrays: Mapping[str, ArrayLike]) -> None:
+    """Write arrays by name as an npz file, atomically."""
+    with atomic_file(path) as file:
+        np.savez(file, **cast(dict[str, Any], dict(arrays)))
 
 
 def write_json(path: str | os.PathLike, report: dict) -> None:

@@ -116,8 +116,10 @@ def test_keypoints_of_another_frame_than_the_cameras_are_noted(stream, make):
 
 
 def test_persons_that_hardly_fit_the_model_are_noted(stream, make, monkeypatch):
-    lift = stream.lifter.lift
-    monkeypatch.setattr(stream.lifter, "lift", lambda *given: replace(lift(*given), unexplained=np.array([0.49, 0.51])))
+    lift = stream.lifter.lift_in_model_layout
+    monkeypatch.setattr(
+        stream.lifter, "lift_in_model_layout", lambda *given: replace(lift(*given), unexplained=np.array([0.49, 0.51]))
+    )
     stream.keypoints(CLOUD, cloud(make, seen(GOOD)))
     assert stream.ledger.notes == {"unlike_the_model": 1}
     assert (
@@ -247,7 +249,7 @@ def test_a_fault_in_lifting_is_counted_and_its_traceback_logged_once(stream, mak
     def fails(*_):
         raise ZeroDivisionError("on purpose")
 
-    monkeypatch.setattr(stream.lifter, "lift", fails)
+    monkeypatch.setattr(stream.lifter, "lift_in_model_layout", fails)
     with caplog.at_level(logging.ERROR):
         for _ in range(3):
             assert_drops(stream, CLOUD, cloud(make, seen(GOOD)))

@@ -12,9 +12,10 @@ import pytest
 import torch
 from conftest import coco_model
 from scipy.spatial.transform import Rotation
-from tiny_data import FROM_RANDOM_WEIGHTS
+from tiny_data import FROM_RANDOM_WEIGHTS, sequence
 
 from msg_adapters.outputs import keypoints_cloud
+from paul_ros.cli import main
 from paul_ros.cli import train as cli
 from paul_ros.errors import ModelError, OutputError
 from paul_ros.layout import load_layout
@@ -358,3 +359,11 @@ def test_an_output_that_cannot_be_written_stops_the_run_before_it_begins(data_fi
     with pytest.raises(OutputError, match="folder"):
         train(data_file, "-o", tmp_path / "folder.npz", *SMALL)
     assert not (tmp_path / "folder.run").exists()
+
+
+def test_the_report_goes_to_standard_output(tmp_path, capsys):
+    np.savez(tmp_path / "views.npz", W=sequence()[0].W)
+    words = [tmp_path / "views.npz", "-o", tmp_path / "model.npz", *FROM_RANDOM_WEIGHTS]
+    words += ["--set", "steps=2", "--quiet", "--json", "-"]
+    assert main(["train", *map(str, words)]) == 0
+    assert json.loads(capsys.readouterr().out)["restarts"][0]["chosen"]

@@ -17,7 +17,7 @@ class TrainingOptions:
         data: npz files or bags, or one folder of motion capture.
         model: model file to write, or None.
         shapes: file of the frames' 3D shapes to write, or None.
-        json: report to write, or None.
+        json: report that the caller writes, or None; here it is only checked.
         layout: of the points, name or YAML file; None: guessed.
         topic: of a bag's keypoints; None: the only one.
         min_confidence: keypoints of a bag below it count as hidden.

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import tempfile
 from collections.abc import Callable, Iterator
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from paul_ros.errors import NpzError
-from paul_ros.files import read_npz, write_atomically
+from paul_ros.files import read_npz, write_npz
 from training.data import TrainingData
 from training.data_checks import check_sizes
 from training.distributed import processes
@@ -61,9 +60,7 @@ class Reconstruction:
     def save(self, path: str | Path) -> None:
         """Write an ``.npz`` of these arrays, atomically."""
         arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays)
-        write_atomically(path, buffer.getvalue())
+        write_npz(path, arrays)
 
 
 def load_reconstruction(path: str | Path) -> Reconstruction:

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session of `paul train`: load the data, train or continue all restarts, write model, shapes and report."""
+"""A session of `paul train`: load the data, train or continue all restarts, write model and shapes."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 
-from paul_ros.files import write_atomically
 from training.data import TrainingData
 from training.data_checks import check_sizes
 from training.distributed import is_first, joined
@@ -34,8 +34,23 @@ _BAR_EVERY = 20
 """Steps between updates of the losses in the progress bar."""
 
 
-def train(options: TrainingOptions) -> None:
-    """Train, or continue, and write the results.
+class Results(NamedTuple):
+    """The results of a session.
+
+    Attributes:
+        report: the model's header and the ranking of the restarts, for JSON.
+        text: the same for people.
+    """
+
+    report: dict[str, Any]
+    text: str
+
+
+def train(options: TrainingOptions) -> Results | None:
+    """Train, or continue, and write model and shapes.
+
+    Returns:
+        The results; None in all processes but the first.
 
     Raises:
         PaulError: bad data, recipe or file.
@@ -54,8 +69,7 @@ def train(options: TrainingOptions) -> None:
             _delete_runs(folders)
         _introduce(data)
         runs = train_restarts(data, recipe, options.run_folder, device, lambda trainer: _watch(trainer, options))
-        if is_first():
-            _write_results(runs, options)
+        return _write_results(runs, options) if is_first() else None
 
 
 def training_device(name: str) -> torch.device:
@@ -135,19 +149,17 @@ def _watch(trainer: Trainer, options: TrainingOptions) -> None:
             board.close()
 
 
-def _write_results(runs: list[FinishedRun], options: TrainingOptions) -> None:
+def _write_results(runs: list[FinishedRun], options: TrainingOptions) -> Results:
     """Write model and shapes of the best run, and report all runs."""
     best = runs[0].trainer
-    header: dict = {}
+    header: dict[str, Any] = {}
     if options.shapes:
         reconstruction_of(runs).save(options.shapes)
     if options.model:
         if best.recipe.codes == "free":
             _fit_encoder(best, options.quiet)
         header = export_model(best, runs[0].loss, options.model, options.command)
-    _print_results(runs, header, options)
-    if options.json:
-        _write_report(runs, header, options.json)
+    return Results({**header, "restarts": _ranking(runs)}, "\n".join(_result_lines(runs, header, options)))
 
 
 def _fit_encoder(trainer: Trainer, quiet: bool) -> None:
@@ -163,25 +175,21 @@ def _fit_encoder(trainer: Trainer, quiet: bool) -> None:
     )
 
 
-def _print_results(runs: list[FinishedRun], header: dict, options: TrainingOptions) -> None:
+def _result_lines(runs: list[FinishedRun], header: dict[str, Any], options: TrainingOptions) -> Iterator[str]:
     if len(runs) > 1:
-        print("restarts by final loss, the first is kept:")
+        yield "restarts by final loss, the first is kept:"
         for run in runs:
-            print(f"  seed {run.seed}  {_loss_text(run)}  {run.trainer.seconds:.0f} s")
+            yield f"  seed {run.seed}  {_loss_text(run)}  {run.trainer.seconds:.0f} s"
     if options.shapes:
-        print(f"{options.shapes}: 3D shapes of {len(runs[0].trainer.data.W)} frames, {_loss_text(runs[0])}")
+        yield f"{options.shapes}: 3D shapes of {len(runs[0].trainer.data.W)} frames, {_loss_text(runs[0])}"
     if options.model:
-        _print_model(runs[0], header, options.model)
-
-
-def _print_model(run: FinishedRun, header: dict, path: Path) -> None:
-    training, metres = header["training"], header["metres_per_unit"]
-    print(
-        f"{path}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
-        f"{_loss_text(run)}\n"
-        f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}\n"
-        f"  chirality: {'known' if header['chirality']['known'] else 'UNKNOWN'}, {header['chirality']['source']}"
-    )
+        training, metres, chirality = header["training"], header["metres_per_unit"], header["chirality"]
+        yield (
+            f"{options.model}: {training['frames']} frames, {training['steps']} steps, {training['seconds']:.0f} s, "
+            f"{_loss_text(runs[0])}"
+        )
+        yield f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}"
+        yield f"  chirality: {'known' if chirality['known'] else 'UNKNOWN'}, {chirality['source']}"
 
 
 def _loss_text(run: FinishedRun) -> str:
@@ -192,9 +200,8 @@ def _loss_text(run: FinishedRun) -> str:
     return f"score of the start {run.loss:.5g} (negative log likelihood a frame, lower is better)"
 
 
-def _write_report(runs: list[FinishedRun], header: dict, path: Path) -> None:
-    """Write the model's header and the ranking of the restarts as JSON."""
-    ranking = [
+def _ranking(runs: list[FinishedRun]) -> list[dict[str, Any]]:
+    return [
         {
             "seed": run.seed,
             "loss": run.loss if math.isfinite(run.loss) else None,
@@ -203,4 +210,3 @@ def _write_report(runs: list[FinishedRun], header: dict, path: Path) -> None:
         }
         for run in runs
     ]
-    write_atomically(path, json.dumps({**header, "restarts": ranking}, indent=1).encode())

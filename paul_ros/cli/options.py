@@ -145,6 +145,14 @@ def share(text: str) -> float:
     return value
 
 
+def confidence(text: str) -> float:
+    """Parse a confidence from 0 to 1."""
+    value = _number(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a confidence from 0 to 1")
+    return value
+
+
 def seconds(text: str) -> float:
     """Parse a number of seconds from 0 on."""
     value = _number(text)

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -13,8 +11,6 @@ from typing import Any, BinaryIO
 
 STDOUT = Path("-")
 """As the FILE of an option: standard output."""
-
-_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | None]) -> None:
@@ -63,27 +59,15 @@ def publish(
 def open_output(path: Path) -> Iterator[BinaryIO]:
     """Open a file that appears whole or not at all, or standard output.
 
-    For output that is written piece by piece; `paul_ros.files.write_atomically` writes what is in memory.
-
     Raises:
         OSError: the file cannot be written; names it.
     """
-    import tempfile
+    from paul_ros.files import atomic_file
 
     if path == STDOUT:
         if sys.stdout is None:
             raise OSError("standard output is closed: name a file")
         yield sys.stdout.buffer
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            yield file
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException as error:
-        os.unlink(temporary)
-        if isinstance(error, OSError) and error.errno in _DISK_FULL:  # which names no file
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        raise
+    with atomic_file(path) as file:
+        yield file

@@ -8,6 +8,8 @@ import importlib.util
 import sys
 from pathlib import Path
 
+from paul_ros.cli.options import Commands, HelpFormatter, add_json, confidence
+from paul_ros.cli.output import STDOUT, publish
 from paul_ros.extras import require
 from paul_ros.stream.parameters import DEFAULTS
 
@@ -24,14 +26,13 @@ The same command continues a stopped run, to the bit. Several processes train as
 """
 
 
-def add_parser(commands: argparse._SubParsersAction) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to `paul`."""
     parser = commands.add_parser(
         "train",
-        help="learn a 3D model of any object from 2D keypoints alone",
         description="Learn a 3D shape model from 2D keypoints alone.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=HelpFormatter,
     )
     add_arguments(parser)
     parser.set_defaults(run=run)
@@ -44,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_training_arguments(parser)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> None:
     """Train, or continue, and write what was asked for.
 
     Raises:
@@ -55,12 +56,12 @@ def run(args: argparse.Namespace) -> int:
     from training.options import TrainingOptions
     from training.session import train
 
-    train(
+    results = train(
         TrainingOptions(
             data=tuple(args.data),
             model=args.output,
             shapes=args.shapes,
-            json=args.json,
+            json=None if args.json == STDOUT else args.json,
             layout=args.layout,
             topic=args.topic,
             min_confidence=args.min_confidence,
@@ -74,7 +75,8 @@ def run(args: argparse.Namespace) -> int:
             command=_command(),
         )
     )
-    return 0
+    if results:
+        publish(results.report, lambda _: results.text, args.json)
 
 
 def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
@@ -94,7 +96,7 @@ def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--topic", help="topic of the 2D keypoints, if a bag has several; * matches any part of a name")
     parser.add_argument(
         "--min-confidence",
-        type=_share,
+        type=confidence,
         default=DEFAULTS["min_confidence"],
         metavar="C",
         help="keypoints of a bag with a lower confidence count as hidden, as in the node (default: %(default)s)",
@@ -109,7 +111,7 @@ def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="write the 3D shapes of the given frames (.npz); MODEL may then be left out",
     )
-    parser.add_argument("--json", metavar="FILE", type=Path, help="write the model's header and the run's figures")
+    add_json(parser, "the model's header and the run's figures")
     parser.add_argument("--tensorboard", action="store_true", help="write logs for TensorBoard beside the checkpoint")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -141,16 +143,6 @@ def _recipe_names() -> list[str]:
     spec = importlib.util.find_spec("training")
     folders = spec.submodule_search_locations if spec else None
     return sorted(path.stem for folder in folders or () for path in Path(folder, "recipes").glob("*.yaml"))
-
-
-def _share(text: str) -> float:
-    try:
-        share = float(text)
-    except ValueError:
-        share = -1.0
-    if not 0 <= share <= 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is no number from 0 to 1")
-    return share
 
 
 def _command() -> str:

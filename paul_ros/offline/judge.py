@@ -188,16 +188,9 @@ def match_truth(pairs: Pairs) -> Matched:
     usable = np.concatenate([lifted.ok for lifted, _ in pairs]) & (present.sum(axis=1) >= MIN_TRUTH_POINTS)
     predicted = np.concatenate([lifted.points for lifted, _ in pairs])[usable]
     present = present[usable]
-    predicted, truth = _filled(predicted, present), _filled(truth[usable], present)
+    predicted, truth = metrics.fill_absent(predicted, present), metrics.fill_absent(truth[usable], present)
     sized = np.ptp(truth, axis=1).max(axis=1) > _MIN_TRUTH_EXTENT
     return Matched(predicted[sized], truth[sized], present[sized])
-
-
-def _filled(points: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return points (M,P,3) with the mean of a person's present points (M,P) in place of the others."""
-    inside = present[..., None]
-    mean = np.where(inside, points, 0.0).sum(axis=1, keepdims=True) / present.sum(axis=1)[:, None, None]
-    return np.where(inside, points, mean)
 
 
 # --- doubt and flips

@@ -12,7 +12,6 @@ Starts are kept beside the experiments.  Experiments with equal starts share one
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import re
 import shutil
@@ -26,7 +25,7 @@ import torch
 from tqdm import tqdm
 
 from paul_ros import __version__
-from paul_ros.files import write_atomically
+from paul_ros.files import write_atomically, write_npz
 from paul_ros.layout import anonymous_layout
 from paul_ros.normalisation import enough_visible
 from training import reconstruction
@@ -214,9 +213,7 @@ def _training_data(experiment: Experiment, folder: Path) -> TrainingData:
     """Return the trainer's data, read from a file that holds W and visible only."""
     order, sequence = experiment.order(), experiment.sequence
     path = folder / "given.npz"
-    buffer = io.BytesIO()
-    np.savez(buffer, W=sequence.W[order].astype(np.float32), visible=sequence.visible[order])
-    write_atomically(path, buffer.getvalue())
+    write_npz(path, {"W": sequence.W[order].astype(np.float32), "visible": sequence.visible[order]})
     data = load_training_data(path, anonymous_layout(sequence.W.shape[2]))
     if data.left_out:
         raise DataError(

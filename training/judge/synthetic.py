@@ -9,14 +9,13 @@ The file holds W (F,2,P) and edges (E,2), for ``paul train``; with --truth also 
 from __future__ import annotations
 
 import argparse
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from paul_ros.files import write_atomically
+from paul_ros.files import write_npz
 
 _Bone = tuple[int, tuple[float, float, float], tuple[float, float, float], float]
 
@@ -169,9 +168,7 @@ def main() -> None:
     arrays: dict[str, Any] = {"W": S[:, :2], "edges": mesh_edges(args.points)}
     if args.truth:
         arrays["S"] = S
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    write_atomically(args.output, buffer.getvalue())
+    write_npz(args.output, arrays)
 
 
 if __name__ == "__main__":

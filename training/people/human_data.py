@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import io
 import json
 import sys
 from collections.abc import Iterable, Iterator
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from paul_ros.errors import NpzError, PaulError
-from paul_ros.files import read_npz, write_atomically
+from paul_ros.files import read_npz, write_npz
 from paul_ros.normalisation import enough_visible
 from paul_ros.output_files import check_outputs
 from training.errors import MocapError, RecipeError, ViewsError
@@ -125,9 +124,9 @@ def make_file(folder: Path, views: ViewSettings, path: Path, truth: Path | None 
         arrays, judged = make(clips, views, progress)
     about = {**json.loads(arrays["about"].tobytes()), **made}
     arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
-    _save(path, arrays)
+    write_npz(path, arrays)
     if truth:
-        _save(truth, judged)
+        write_npz(truth, judged)
 
 
 def _digest(folder: Path) -> str:
@@ -157,12 +156,6 @@ def _made_of(path: Path) -> dict[str, Any] | None:
         return {name: about[name] for name in ("format", "files", "views")}
     except (NpzError, ValueError, KeyError, TypeError):
         return None
-
-
-def _save(path: Path, arrays: dict[str, Any]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    write_atomically(path, buffer.getvalue())
 
 
 def views_of(recipe: Recipe) -> ViewSettings:
