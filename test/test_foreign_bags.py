@@ -280,7 +280,7 @@ def test_a_person_that_cannot_be_read_leaves_the_others(stream, make):
 
 def test_a_fault_in_lifting_loses_only_the_frame_it_was_in(stream, make, monkeypatch):
     send(stream, make, 1)
-    monkeypatch.setattr(stream.lifter, "lift", lambda *_: 1 / 0)
+    monkeypatch.setattr(stream.lifter, "lift_in_model_layout", lambda *_: 1 / 0)
     assert send(stream, make, 2, seconds=2) is None and stream.ledger.drops == {"internal_error": 1}
     monkeypatch.undo()
     assert stream.flush().keypoints.ids == ("2",)

@@ -96,8 +96,10 @@ def test_a_message_that_vanishes_would_be_noticed(monkeypatch):
 
 
 def test_numbers_that_are_not_finite_would_be_noticed(monkeypatch):
-    lift = Lifter.lift
-    monkeypatch.setattr(Lifter, "lift", lambda *a: replace(lift(*a), root=np.full((len(a[1]), 3), np.nan)))
+    lift = Lifter.lift_in_model_layout
+    monkeypatch.setattr(
+        Lifter, "lift_in_model_layout", lambda *a: replace(lift(*a), root=np.full((len(a[1]), 3), np.nan))
+    )
     assert command.fuzz(50, kinds=("fields",))["crashes"]
 
 
