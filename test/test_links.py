@@ -75,3 +75,10 @@ def test_a_broken_link_is_found(tmp_path: Path) -> None:
         '![g](out.png "title") <img src="gone.svg"> <a href="here.md"> [h](here.md#below)\n'
     )
     assert broken_links(tmp_path / "here.md") == ["gone.md", "#below", "out.png", "gone.svg", "here.md#below"]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_the_source_files_that_a_page_names_exist(document: Path) -> None:
+    folders = "paul_ros|msg_adapters|training|test|docs|benchmarks|bags"
+    named = re.findall(rf"`((?:{folders})/[\w./]*)`", document.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
