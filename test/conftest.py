@@ -76,6 +76,12 @@ def packages_of(module: str) -> set[str]:
     return {name.partition(".")[0] for name in reached} | (BAGS if "paul_ros.offline.bag_records" in reached else set())
 
 
+def needs(*packages: str) -> pytest.MarkDecorator:
+    """Skip a test that starts processes which need packages that a robot may lack."""
+    missing = sorted(MISSING.intersection(packages))
+    return pytest.mark.skipif(bool(missing), reason=f"{', '.join(missing)} not installed")
+
+
 _FILES = sorted(Path(__file__).parent.glob("test_*.py"))
 collect_ignore = [file.name for file in _FILES if MISSING and packages_of(file.stem) & MISSING]
 

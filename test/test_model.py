@@ -10,6 +10,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from conftest import needs
 
 from paul_ros.errors import ModelError
 from paul_ros.layout import load_layout
@@ -284,6 +285,7 @@ def test_shipped_human_model():
     json.dumps(model.header)
 
 
+@needs("torch")
 def test_forward_pass_equals_torch(saved):
     """In a process of its own: torch must not enter the process of the runtime's tests."""
     code = f"""

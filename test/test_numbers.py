@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from conftest import needs
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -32,6 +33,7 @@ def test_figures_and_generated_tables_are_up_to_date(page: Path) -> None:
     assert generate.filled(text) == text, "run python docs/generate.py"
 
 
+@needs("mcap", "rosbags")
 def test_quick_figures_are_those_measured_now() -> None:
     measure = script("measure")
     stored = json.loads(generate.NUMBERS.read_text())
