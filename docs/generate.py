@@ -108,7 +108,8 @@ def recipes() -> str:
         head = itertools.takewhile(lambda line: line.startswith("#"), lines)
         purpose = " ".join(line[2:] for line in head if "SPDX" not in line)
         sets = [line.split("  #")[0] for line in lines if line and not line.startswith(("#", " "))]
-        rows.append((f"`{path.stem}`", purpose, ", ".join(f"`{line}`" for line in sets)))
+        shown = (f"{line} ..." if line.endswith(":") else line for line in sets)
+        rows.append((f"`{path.stem}`", purpose, ", ".join(f"`{line}`" for line in shown)))
     return table(("recipe", "purpose", "settings"), rows)
 
 
@@ -151,7 +152,7 @@ def _code(text: str) -> str:
 
 def commands() -> str:
     """Return every command of `paul` with its arguments, from the parsers themselves."""
-    return "\n".join(_commands(paul_parser(), "paul"))
+    return "\n".join(_commands(paul_parser(), "paul", None))
 
 
 def paul_parser() -> argparse.ArgumentParser:
@@ -161,7 +162,8 @@ def paul_parser() -> argparse.ArgumentParser:
     return launcher.build_parser()
 
 
-def _commands(parser: argparse.ArgumentParser, name: str) -> Iterator[str]:
+def _commands(parser: argparse.ArgumentParser, name: str, said: str | None) -> Iterator[str]:
+    """Yield the parts of a command and of those below it; `said` is an epilog that was already shown."""
     groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     if name != "paul":
         yield f"## `{name}`\n\n{_escaped(parser.description or '')}\n"
@@ -170,11 +172,11 @@ def _commands(parser: argparse.ArgumentParser, name: str) -> Iterator[str]:
         yield f"```text\n{' '.join([name, *positional, '[options]'])}\n```\n"
         shown = [action for action in parser._actions if action.help != argparse.SUPPRESS and action.dest != "help"]
         yield table(("argument", "meaning"), [_row(action, parser) for action in shown])
-        if parser.epilog:
-            yield f"```text\n{parser.epilog.strip()}\n```\n"
+    if name != "paul" and parser.epilog and parser.epilog != said:
+        yield f"```text\n{parser.epilog.strip()}\n```\n"
     for group in groups:
         for word, child in group.choices.items():
-            yield from _commands(child, f"{name} {word}")
+            yield from _commands(child, f"{name} {word}", parser.epilog)
 
 
 def _row(action: argparse.Action, parser: argparse.ArgumentParser) -> tuple[str, str]:
