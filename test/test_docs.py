@@ -23,10 +23,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from conftest import needs
 from test_numbers import script
 
 from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout
+from paul_ros.ros.diagnostics import Health
 from paul_ros.stream.parameters import DEFAULTS
 from paul_ros.stream.stream import open_stream
 
@@ -186,6 +188,7 @@ def having(holds: Callable[[Block], bool]) -> list:
     return [pytest.param(page, id=NAMES[page]) for page in PAGES if any(map(holds, blocks(page)))]
 
 
+@needs("mcap", "rosbags", "torch", "matplotlib", "rich", "tqdm")
 @pytest.mark.parametrize("page", having(lambda block: block.runs or block.kind == "python"))
 def test_the_code_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -224,6 +227,7 @@ def first_column(page: str, heading: str) -> set[str]:
     return {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
 
 
+@needs("mcap", "rosbags")
 def test_the_keys_of_a_replay_are_those_documented(tmp_path: Path) -> None:
     report = tmp_path / "report.json"
     run(
@@ -238,6 +242,29 @@ def test_the_keys_of_a_layout_file_are_those_documented() -> None:
         Layout.from_dict({"colour": "red"})
     known = str(refused.value).split("keys are ")[1]
     assert set(known.split(", ")) == first_column("docs/reference/layouts.md", "## Keys")
+
+
+def test_the_values_of_the_diagnostics_are_those_documented() -> None:
+    reported = Health(0.0).report(1.0, open_stream()).values
+    assert reported.keys() == first_column("docs/reference/node.md", "## Diagnostics")
+
+
+@needs("mcap", "rosbags")
+@pytest.mark.parametrize(
+    "thing, further",
+    [
+        ("human", ("docs/reference/json.md", "## The model file")),
+        ("coco17", ("docs/reference/layouts.md", "## Keys")),
+        ("bags/one_person.mcap", None),
+    ],
+)
+def test_the_keys_of_an_inspection_are_those_documented(thing: str, further: tuple | None, tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    run([sys.executable, "-m", "paul_ros.cli", "inspect", thing, "--json", str(report)], ROOT)
+    found = json.loads(report.read_text())
+    section = (ROOT / "docs/reference/json.md").read_text().split("## `paul inspect`\n")[1].split("\n## ")[0]
+    (row,) = re.findall(rf"^\| `{found.pop('kind')}` \|.*", section, re.M)
+    assert found.keys() <= set(re.findall(r"`(\w+)`", row)) | (first_column(*further) if further else set())
 
 
 def test_the_keys_of_the_layout_topic_are_those_documented() -> None:
