@@ -63,6 +63,11 @@ def test_sources_name_pages_that_exist(folder: str) -> None:
     assert {name: file for file in files for name in named_pages(file) if not (ROOT / name).exists()} == {}
 
 
+@pytest.mark.parametrize("name, most", [("README.md", 110), ("benchmarks/RESULTS.md", 150)])
+def test_pages_for_everybody_are_short(name: str, most: int) -> None:
+    assert len((ROOT / name).read_text().splitlines()) <= most
+
+
 def test_every_page_is_in_the_index() -> None:
     index = (ROOT / "docs/index.md").read_text()
     pages = [path.relative_to(ROOT / "docs").with_suffix("") for path in (ROOT / "docs").rglob("*.md")]

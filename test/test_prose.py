@@ -67,7 +67,7 @@ def faults(sentence: str) -> str:
 @pytest.fixture(scope="module")
 def places() -> list[tuple[Path, str, str]]:
     """(file, sentence, fault) of everything that a user or a maintainer reads."""
-    files = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    files = [ROOT / "README.md", ROOT / "benchmarks/RESULTS.md", *(ROOT / "docs").rglob("*.md")]
     files += [file for package in PACKAGES for suffix in ("*.py", "*.md") for file in (ROOT / package).rglob(suffix)]
     return [
         (file.relative_to(ROOT), sentence, faults(sentence))
