@@ -97,6 +97,7 @@ def test_bytes_in_and_out_say_the_same_as_messages(model_file, bag_make):
     data = bytes(store.serialize_cdr(msg, CLOUD))
     frames = [open_stream(str(model_file)).keypoints(CLOUD, given).frame for given in (msg, data)]
     packed = [name for name, output in OUTPUTS.items() if output.packed]
+    assert packed == ["poses", "keypoints3d"]
     as_bytes = MessageBuilder(bag_make, packed=True).messages(frames[1], packed)
     for name, message in MessageBuilder(bag_make).messages(frames[0], packed).items():
         kind = OUTPUTS[name].message_type

@@ -17,7 +17,7 @@ from paul_ros.layout import anonymous_layout
 from paul_ros.model_file import load_model, save_model, weight_shapes
 from training import reconstruction
 from training.categories import joint_layout
-from training.judge.studies import interpolation
+from training.judge.studies import interpolation, registry
 from training.judge.studies.latent import roughness
 from training.judge.truth import random_rotations
 from training.reconstruction import Reconstruction
@@ -248,7 +248,7 @@ def test_two_files_of_one_name_are_refused(files, tmp_path, fake, capsys):
 
 
 def test_every_study_of_the_command_line_is_there(capsys):
-    assert set(STUDIES) == set(STUDIES)
+    assert set(STUDIES) == set(registry.STUDIES)
     for name in (*STUDIES, "interpolation"):
         with pytest.raises(SystemExit) as end:
             cli.main(["study", name, "--help"])

@@ -60,7 +60,7 @@ class ViewSettings:
         ("mediapipe33", 0.15),
         (COMPLETE, 0.15),
     )
-    seed: int = 0
+    seed: int = 0  # of all random numbers
 
     def __post_init__(self) -> None:
         for name in _RANGES:
