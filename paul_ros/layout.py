@@ -266,6 +266,8 @@ def load_layout(name_or_path: str | os.PathLike[str]) -> Layout:
     Raises:
         LayoutError: the name is unknown, or the file is unreadable, too large, or describes no layout.
     """
+    if not isinstance(name_or_path, (str, os.PathLike)):
+        raise LayoutError(f"layout is a {type(name_or_path).__name__}: pass a name or the path of a YAML file")
     name = str(name_or_path)
     if name in layout_names():
         return _shipped(name)

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import os
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import InputError, ModelError
 from paul_ros.layout import Layout, midpoints
-from paul_ros.lift_arguments import as_intrinsics, as_layout, as_points
+from paul_ros.lift_arguments import Camera, as_intrinsics, as_layout, as_points, check_height
 from paul_ros.lifted import (
     BEHIND_CAMERA,
     DEGENERATE_POINTS,
@@ -62,10 +62,11 @@ class Lifter:
 
         Args:
             model: a Model, the name of a shipped model such as ``"human"``, or the path of a model file.
-            person_height: see the property.
+            person_height: known height of the persons in metres; 0 if unknown.
 
         Raises:
             ModelError: there is no such model, its file is damaged, or it has one fixed scale, which no image has.
+            InputError, ModelError: see ``person_height``.
         """
         if not isinstance(model, Model):
             model = load_model(model)
@@ -84,13 +85,16 @@ class Lifter:
     def person_height(self) -> float:
         """Known height of the persons in metres; 0 if unknown, and the model's stature is assumed.
 
-        Setting it raises ModelError if the model does not know the stature that its metres refer to.
+        Raises:
+            InputError: on setting, the height is no number of metres.
+            ModelError: on setting, the model does not know the stature that its metres refer to.
         """
         return self._person_height
 
     @person_height.setter
     def person_height(self, height: float) -> None:
         stature, metres = self.model.stature, self.model.metres_per_unit
+        check_height(height)
         if height:
             if not (stature and metres):
                 raise ModelError(
@@ -105,9 +109,9 @@ class Lifter:
 
     def lift(
         self,
-        points: Any,
-        visible: Any = None,
-        camera: Any = None,
+        points: ArrayLike,
+        visible: ArrayLike | None = None,
+        camera: Camera | None = None,
         layout: Layout | str | os.PathLike[str] | None = None,
     ) -> Lifted:
         """Lift N persons.
@@ -127,7 +131,7 @@ class Lifter:
 
         Raises:
             InputError: an argument has a wrong shape, type or value.
-            LayoutError: the layout does not exist or shares fewer than 3 points with the model's.
+            LayoutError: the layout does not exist, is malformed, or shares fewer than 3 points with the model's.
         """
         if layout is None:
             xy, seen = as_points(points, visible, self.model.layout)
