@@ -34,7 +34,7 @@ HEIGHT_SPREAD = 0.06
 
 _LINE = 0.005
 """Points are on one line if their rms spread across it is below this share of the rms spread along it: 0.3 pixels, the
-rounding to whole ones, on 60.  Persons in the shipped bags, some seen from the side and half hidden, have at least
+rounding to whole ones, on 60. Persons in the shipped bags, some seen from the side and half hidden, have at least
 0.028."""
 
 _FARTHEST_PIXEL = 1e6
@@ -118,15 +118,15 @@ class Lifter:
 
         Args:
             points: (N,P,2) pixels, or (P,2) for one person; NaN, or any other value, where hidden.
-            visible: (N,P), or (P,) for one person, bool; None for all points with finite coordinates.  Points more than
+            visible: (N,P), or (P,) for one person, bool; None for all points with finite coordinates. Points more than
                 a million pixels out are always hidden.
             camera: pinhole camera of the (rectified) image, for output in metres: Intrinsics, a 3x3 camera matrix K in
-                pixels, or a sensor_msgs/CameraInfo message.  None for output in model units.
-            layout: layout of the points: a shipped one by name, the path of a YAML file, or a Layout.  None
+                pixels, or a sensor_msgs/CameraInfo message. None for output in model units.
+            layout: layout of the points: a shipped one by name, the path of a YAML file, or a Layout. None
                 for the model's own.
 
         Returns:
-            N persons (N = 1 for one person without the first axis).  Their points are in the given layout if the
+            N persons (N = 1 for one person without the first axis). Their points are in the given layout if the
             model completes all of its points, else in the model's; ``Lifted.layout`` names it.
 
         Raises:
@@ -211,7 +211,7 @@ class Lifter:
     def _as_seen(self, fit: ShapeFit, pinhole: bool) -> np.ndarray:
         """Return shapes (N,3,P) in the virtual cameras' frames, with points moved sideways to where they were seen.
 
-        This is S_cam = [W; z] of the paper's equation 4, as far as a detector can be trusted.  Points within two
+        This is S_cam = [W; z] of the paper's equation 4, as far as a detector can be trusted. Points within two
         standard deviations of the model's misfit move all the way; the farther others are, the less they move.
         """
         shape = fit.R @ fit.S
@@ -225,7 +225,7 @@ class Lifter:
     def _place_midpoints(self, shape: np.ndarray, used: np.ndarray) -> None:
         """Move midpoints in shapes (N,3,P), in place, to the mean of their two points.
 
-        So the root of a person is in the middle of its hips.  A midpoint that was seen stays if one of its two points
+        So the root of a person is in the middle of its hips. A midpoint that was seen stays if one of its two points
         was not, for instance a pelvis beside a hidden hip.
         """
         point, parts = self._midpoints
