@@ -253,7 +253,10 @@ def _with_rival(xp: Kind, problem: Problem, best: View, other: View, scale: Scal
 
 
 def start_direction(xp: Kind, problem: Problem) -> Vector:
-    """Return the direction of least squares along the two thick axes and of a rotation along the thin one.
+    """Return a cheap estimate of the best direction, where the climb starts.
+
+    Along the two thick axes of the shape it is the least-squares solution. Along the thin axis it satisfies the
+    constraint of a rotation.
 
     Rotations have q^T q = 0 for q = s (r1 + i r2). This leaves two roots for q_0, Necker reversals of each other.
     Least squares gives d_0 / a_0, which is all noise if a_0 is small and then only chooses the root. The thinner the
