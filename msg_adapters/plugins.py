@@ -107,7 +107,7 @@ class Plugin:
 
     @property
     def one_person(self) -> bool:
-        """Has each message one person? False if the adapter cannot be loaded."""
+        """True if each message holds one person; False also if the adapter cannot be loaded."""
         return isinstance(self._loaded, Adapter) and bool(self._loaded.one_person)
 
     def _ask(self, question: Callable[[Adapter], _T]) -> _T:

@@ -7,7 +7,7 @@
 ('human', 17)
 
 The names below are imported when they are first used: the node sets the number of threads before numpy is imported,
-and ``paul --help`` needs no numpy.  The package itself needs NumPy, PyYAML and, for the node, ROS 2.
+and ``paul --help`` needs no numpy. The package itself needs NumPy, PyYAML and, for the node, ROS 2.
 """
 
 from __future__ import annotations

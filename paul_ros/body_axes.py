@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Body axes of lifted persons (REP-155: x out of the chest, y to the left, z to the head), as quaternions.
 
-Hips and shoulders with their usual names define the axes.  Without them, the layout's first rule of handedness defines
-left and up, and left x up = forward gives the rest.  A layout without either, for instance of an object without a
+Hips and shoulders with their usual names define the axes. Without them, the layout's first rule of handedness defines
+left and up, and left x up = forward gives the rest. A layout without either, for instance of an object without a
 chest, gets the rotation of the model's canonical frame, which is the same for all poses of one shape.
 """
 
@@ -68,7 +68,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def quaternions(R: np.ndarray) -> np.ndarray:
     """Return unit quaternions (N,4), in order x, y, z, w with w >= 0, of rotations (N,3,3).
 
-    Four times the outer product of a quaternion with itself is linear in the rotation.  Its largest row is the
+    Four times the outer product of a quaternion with itself is linear in the rotation. Its largest row is the
     quaternion up to length and sign.
 
     >>> import numpy as np
@@ -93,8 +93,8 @@ def quaternions(R: np.ndarray) -> np.ndarray:
 class ContinuousSigns:
     """Signs of quaternions that are continuous from frame to frame.
 
-    q and -q are the same attitude, and every rule for single frames jumps between them somewhere.  Here the quaternion
-    of a tracked person has the sign nearer to the previous frame's.  Without an id, or if the person was not in the
+    q and -q are the same attitude, and every rule for single frames jumps between them somewhere. Here the quaternion
+    of a tracked person has the sign nearer to the previous frame's. Without an id, or if the person was not in the
     previous frame, w >= 0.
     """
 

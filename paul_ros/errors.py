@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that a user can cause and fix.  The text of each is one line that says what to do.
+"""Errors that a user can cause and fix. The text of each is one line that says what to do.
 
 Any other exception is a bug of this package and shows its traceback.
 """
@@ -32,7 +32,7 @@ class ParameterError(PaulError, ValueError):
 
 
 class NpzError(PaulError, ValueError):
-    """An npz file cannot be used.  The text continues a sentence that begins with the file's name."""
+    """An npz file cannot be used. The text continues a sentence that begins with the file's name."""
 
 
 class KeypointFileError(PaulError, ValueError):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import tempfile
@@ -18,7 +17,6 @@ from numpy.typing import ArrayLike
 from paul_ros.errors import NpzError
 
 _NAMED = 5  # most arrays that an error names
-_NAMELESS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # errors of a full disk, which name no file
 
 
 def read_npz(
@@ -57,7 +55,7 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """Open a file for writing that is complete or unchanged when the block ends; missing folders are made.
 
     Raises:
-        OSError: the file cannot be written.  The error names the file, also if the disk is full.
+        OSError: the file cannot be written. The error names the file, never the temporary one.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -69,7 +67,8 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
         os.replace(temporary, path)
     except BaseException as error:
         os.unlink(temporary)
-        if isinstance(error, OSError) and error.errno in _NAMELESS:
+        # A full disk names no file, and a refused rename names the temporary one.
+        if isinstance(error, OSError) and error.errno and error.filename in (None, temporary):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 

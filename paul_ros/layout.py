@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Layouts: named keypoints, their edges and sides, and mappings between layouts.
 
-All shipped layouts take their names from one vocabulary, so a layout maps onto another by name alone.  Points at only
+All shipped layouts take their names from one vocabulary, so a layout maps onto another by name alone. Points at only
 nearly the same place on the body have different names.
 """
 
@@ -30,8 +30,8 @@ _MAX_BYTES = 1_000_000
 class Handedness:
     """A rule of anatomy that distinguishes a shape from its mirror image; each attribute holds point indices.
 
-    Let m(.) be the mean of points.  Then (m(left) - m(right)) x (m(above) - m(below)) points along
-    m(front) - m(behind) in any right-handed frame.  This is left x up = forward, as in REP-103's body frame.
+    Let m(.) be the mean of points. Then (m(left) - m(right)) x (m(above) - m(below)) points along
+    m(front) - m(behind) in any right-handed frame. This is left x up = forward, as in REP-103's body frame.
     """
 
     left: Points
@@ -79,8 +79,8 @@ class Layout:
         derived: names of further points -> the indices whose mean each is.
         handedness: rules of anatomy; may be empty.
         description: what the layout is and the source of its order.
-        categories: kinds of objects whose points lie side by side: name -> point indices.  A frame of one kind has
-            points of that category only.  Empty if all points belong to one object.
+        categories: kinds of objects whose points lie side by side: name -> point indices. A frame of one kind has
+            points of that category only. Empty if all points belong to one object.
         min_visible: fewest visible points of an object that are lifted; None for 30 %, at least 4.
     """
 
@@ -200,12 +200,12 @@ class Mapping:
     def __call__(
         self, xy: np.ndarray, confidence: np.ndarray, visible: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Map 2D keypoints.  Points that the source lacks are hidden: xy NaN, confidence 0.
+        """Map 2D keypoints. Points that the source lacks are hidden: xy NaN, confidence 0.
 
         Args:
             xy: (N,P,2) any unit.
             confidence: (N,P).
-            visible: (N,P) bool.  A derived point is visible only if all its parts are.
+            visible: (N,P) bool. A derived point is visible only if all its parts are.
 
         Returns:
             The same with the target's points.
@@ -266,6 +266,8 @@ def load_layout(name_or_path: str | os.PathLike[str]) -> Layout:
     Raises:
         LayoutError: the name is unknown, or the file is unreadable, too large, or describes no layout.
     """
+    if not isinstance(name_or_path, (str, os.PathLike)):
+        raise LayoutError(f"layout is a {type(name_or_path).__name__}: pass a name or the path of a YAML file")
     name = str(name_or_path)
     if name in layout_names():
         return _shipped(name)
@@ -297,7 +299,7 @@ def midpoints(layout: Layout) -> dict[int, Points]:
     """Return the points of a shipped layout that are means of others of its points.
 
     They are found from other shipped layouts, which derive them: pelvis and neck of ``human`` are the midpoints of
-    hips and shoulders.  A user's layout has none, because its names may belong to an animal, whose neck is elsewhere.
+    hips and shoulders. A user's layout has none, because its names may belong to an animal, whose neck is elsewhere.
 
     Returns:
         Index of each such point -> indices of the points whose mean it is.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The schema of a layout: check what a YAML file or a model's header says, and resolve names to point indices.
 
-``paul_ros.layout.Layout`` describes the keys.  Every error names the key at fault.
+``paul_ros.layout.Layout`` describes the keys. Every error names the key at fault.
 """
 
 from __future__ import annotations

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arguments of ``Lifter.lift``: checked, and converted to arrays, intrinsics and layouts."""
+"""The arguments of the Lifter: checked, and converted to arrays, intrinsics and layouts."""
 
 from __future__ import annotations
 
+import math
+import numbers
 import os
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msg_adapters.camera_info import read_camera_info
 from msg_adapters.keypoints import Intrinsics, MessageError
@@ -17,7 +20,26 @@ _FOCAL_LENGTHS = (10.0, 1e6)
 """Pixels, limits of plausible focal lengths; a normalised K is below them."""
 
 
-def as_points(points: Any, visible: Any, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+class CameraInfo(Protocol):
+    """A sensor_msgs/CameraInfo of any message library: its size in pixels and its matrices d, k and p."""
+
+    @property
+    def width(self) -> Any: ...
+    @property
+    def height(self) -> Any: ...
+    @property
+    def d(self) -> Any: ...
+    @property
+    def k(self) -> Any: ...
+    @property
+    def p(self) -> Any: ...
+
+
+Camera = Intrinsics | CameraInfo | ArrayLike
+"""A pinhole camera: intrinsics, a CameraInfo message, or a 3x3 camera matrix K in pixels."""
+
+
+def as_points(points: ArrayLike, visible: ArrayLike | None, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Convert 2D points and their visibility to arrays.
 
     Args:
@@ -31,22 +53,20 @@ def as_points(points: Any, visible: Any, layout: Layout) -> tuple[np.ndarray, np
     Raises:
         InputError: a shape or type is wrong; the text says what to pass instead.
     """
-    xy = _as_floats(points, "points")
-    if xy.ndim == 2:
-        xy = xy[None]
-        visible = None if visible is None else np.asarray(visible)[None]
+    given = _as_floats(points, "points")
+    xy = given[None] if given.ndim == 2 else given
     P = len(layout.names)
     if xy.ndim != 3 or xy.shape[1:] != (P, 2):
         raise InputError(
-            f"points have shape {np.shape(points)}, layout '{layout.name}' needs (N,{P},2), or ({P},2) for one "
+            f"points have shape {given.shape}, layout '{layout.name}' needs (N,{P},2), or ({P},2) for one "
             f"person{_advice(xy, layout)}"
         )
     if visible is None:
         return xy, np.isfinite(xy).all(2)
-    return xy, _as_visibility(visible, xy)
+    return xy, _as_visibility(visible, given).reshape(xy.shape[:2])
 
 
-def as_intrinsics(camera: Any) -> Intrinsics | None:
+def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
     """Convert a camera to intrinsics.
 
     Args:
@@ -63,6 +83,8 @@ def as_intrinsics(camera: Any) -> Intrinsics | None:
             return read_camera_info(camera)
         except MessageError as error:
             raise InputError(str(error)) from None
+        except (AttributeError, IndexError, TypeError, ValueError) as error:
+            raise InputError(f"camera of type {type(camera).__name__} is no sensor_msgs/CameraInfo: {error}") from None
     K = _as_floats(camera, "camera")
     if K.shape != (3, 3):
         raise InputError(
@@ -79,24 +101,34 @@ def as_intrinsics(camera: Any) -> Intrinsics | None:
     return Intrinsics(fx, fy, cx, cy, 0, 0, matrix="K")
 
 
-def as_layout(layout: Any) -> Layout:
+def as_layout(layout: Layout | str | os.PathLike[str]) -> Layout:
     """Return a layout, given itself, its name, or the path of its YAML file.
 
     Raises:
-        InputError: the argument is none of these.
-        LayoutError: there is no such layout.
+        LayoutError: the argument is none of these, or there is no such layout.
     """
-    if isinstance(layout, Layout):
-        return layout
-    if not isinstance(layout, (str, os.PathLike)):
-        raise InputError(f"layout is a {type(layout).__name__}: pass a name, the path of a YAML file, or a Layout")
-    return load_layout(layout)
+    return layout if isinstance(layout, Layout) else load_layout(layout)
 
 
-def _as_visibility(visible: Any, xy: np.ndarray) -> np.ndarray:
-    seen = np.asarray(visible)
-    if seen.shape != xy.shape[:2]:
-        raise InputError(f"visible has shape {seen.shape}, points {xy.shape} need {xy.shape[:2]}")
+def check_height(height: Any) -> None:
+    """Check a height of persons in metres; 0 is an unknown height.
+
+    Raises:
+        InputError: the height is no number, negative or not finite.
+    """
+    is_number = isinstance(height, numbers.Real)
+    if not (is_number and 0 <= height < math.inf):
+        raise InputError(f"person_height is {height!r}: pass metres, or 0 if it is unknown")
+
+
+def _as_visibility(visible: ArrayLike, points: np.ndarray) -> np.ndarray:
+    """Return visibility as bool, of the shape of the points (..., 2) without their last axis."""
+    try:
+        seen = np.asarray(visible)
+    except ValueError as error:  # rows of unequal length
+        raise InputError(f"visible cannot be an array: {error}") from None
+    if seen.shape != points.shape[:-1]:
+        raise InputError(f"visible has shape {seen.shape}, points {points.shape} need {points.shape[:-1]}")
     if seen.dtype != bool:
         if seen.dtype.kind not in "iuf" or not ((seen == 0) | (seen == 1)).all():
             raise InputError("visible must be true or false: compare confidences with a threshold, as in scores > 0.3")

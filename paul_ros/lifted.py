@@ -34,31 +34,31 @@ class Lifted:
     """N persons in 3D.
 
     Attributes:
-        points: (N,P,3) points of ``layout`` in the camera's optical frame (x right, y down, z forward).  They are
-            metres from the camera's centre if ``units`` is ``"m"``, else model units from the root.  NaN if not lifted.
-        root: (N,3) root point of the model's layout, same frame and units.  In shipped layouts this is the middle of
+        points: (N,P,3) points of ``layout`` in the camera's optical frame (x right, y down, z forward). They are
+            metres from the camera's centre if ``units`` is ``"m"``, else model units from the root. NaN if not lifted.
+        root: (N,3) root point of the model's layout, same frame and units. In shipped layouts this is the middle of
             the hips in ``points``, except if the pelvis was seen but not both hips.
         rotation: (N,3,3) canonical frame to camera frame, det +1.
         scale: (N,) pixels per model unit at the person's distance.
-        reprojection: (N,) pixels, rms error of the model's own shape over the points used.  The error of ``points`` is
+        reprojection: (N,) pixels, rms error of the model's own shape over the points used. The error of ``points`` is
             smaller: they are moved to where they were seen (S_cam of the paper's equation 4).
-        unexplained: (N,) reprojection over the rms extent of the points used.  It is 0 if the shape explains the image,
+        unexplained: (N,) reprojection over the rms extent of the points used. It is 0 if the shape explains the image,
             and near 1 if it explains nothing, for instance if the points are in the order of another layout.
         ambiguity: (N,) 0..1, residual of the pose over that of its depth-reversed rival, the second optimum of
             orthographic-N-point.  0 without a rival, 1 if the image cannot distinguish them.
         certified: (N,) bool, the pose, or the start of its pinhole refinement, is the proven optimum of
             orthographic-N-point.
-        distance_sigma: (N,) metres, standard deviation of the root's distance; NaN in model units.  It combines the
+        distance_sigma: (N,) metres, standard deviation of the root's distance; NaN in model units. It combines the
             spread of people's heights (unless the height is known) with ``unexplained``, which equals the relative
             distance errors of persons in the shipped bags.
-        used: (N,P) bool, the points that the person was lifted from: the visible ones without misdetections.  Those
+        used: (N,P) bool, the points that the person was lifted from: the visible ones without misdetections. Those
             are points beyond 60 degrees from the person's direction, or far from the lifted shape.
         reason: N slugs, '' if lifted, else why not:
             ``too_few_points``: fewer visible points than the model needs.
-            ``degenerate_points``: the points fix no pose.  They lie on one line or in two places or, with intrinsics,
+            ``degenerate_points``: the points fix no pose. They lie on one line or in two places or, with intrinsics,
             have an rms extent below 1 pixel.
             ``too_far``: a coordinate would exceed 200 m.
-            ``behind_camera``: the root, or in metres a point used, would not be in front of the camera.  Points not
+            ``behind_camera``: the root, or in metres a point used, would not be in front of the camera. Points not
             used may be behind it, such as the feet of a near person if the camera looks up.
         units: ``"m"`` or ``"model"``.
         layout: layout of the P points.

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import os
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import InputError, ModelError
 from paul_ros.layout import Layout, midpoints
-from paul_ros.lift_arguments import as_intrinsics, as_layout, as_points
+from paul_ros.lift_arguments import Camera, as_intrinsics, as_layout, as_points, check_height
 from paul_ros.lifted import (
     BEHIND_CAMERA,
     DEGENERATE_POINTS,
@@ -34,7 +34,7 @@ HEIGHT_SPREAD = 0.06
 
 _LINE = 0.005
 """Points are on one line if their rms spread across it is below this share of the rms spread along it: 0.3 pixels, the
-rounding to whole ones, on 60.  Persons in the shipped bags, some seen from the side and half hidden, have at least
+rounding to whole ones, on 60. Persons in the shipped bags, some seen from the side and half hidden, have at least
 0.028."""
 
 _FARTHEST_PIXEL = 1e6
@@ -62,10 +62,11 @@ class Lifter:
 
         Args:
             model: a Model, the name of a shipped model such as ``"human"``, or the path of a model file.
-            person_height: see the property.
+            person_height: known height of the persons in metres; 0 if unknown.
 
         Raises:
             ModelError: there is no such model, its file is damaged, or it has one fixed scale, which no image has.
+            InputError, ModelError: see ``person_height``.
         """
         if not isinstance(model, Model):
             model = load_model(model)
@@ -84,13 +85,16 @@ class Lifter:
     def person_height(self) -> float:
         """Known height of the persons in metres; 0 if unknown, and the model's stature is assumed.
 
-        Setting it raises ModelError if the model does not know the stature that its metres refer to.
+        Raises:
+            InputError: on setting, the height is no number of metres.
+            ModelError: on setting, the model does not know the stature that its metres refer to.
         """
         return self._person_height
 
     @person_height.setter
     def person_height(self, height: float) -> None:
         stature, metres = self.model.stature, self.model.metres_per_unit
+        check_height(height)
         if height:
             if not (stature and metres):
                 raise ModelError(
@@ -105,29 +109,29 @@ class Lifter:
 
     def lift(
         self,
-        points: Any,
-        visible: Any = None,
-        camera: Any = None,
+        points: ArrayLike,
+        visible: ArrayLike | None = None,
+        camera: Camera | None = None,
         layout: Layout | str | os.PathLike[str] | None = None,
     ) -> Lifted:
         """Lift N persons.
 
         Args:
             points: (N,P,2) pixels, or (P,2) for one person; NaN, or any other value, where hidden.
-            visible: (N,P), or (P,) for one person, bool; None for all points with finite coordinates.  Points more than
+            visible: (N,P), or (P,) for one person, bool; None for all points with finite coordinates. Points more than
                 a million pixels out are always hidden.
             camera: pinhole camera of the (rectified) image, for output in metres: Intrinsics, a 3x3 camera matrix K in
-                pixels, or a sensor_msgs/CameraInfo message.  None for output in model units.
-            layout: layout of the points: a shipped one by name, the path of a YAML file, or a Layout.  None
+                pixels, or a sensor_msgs/CameraInfo message. None for output in model units.
+            layout: layout of the points: a shipped one by name, the path of a YAML file, or a Layout. None
                 for the model's own.
 
         Returns:
-            N persons (N = 1 for one person without the first axis).  Their points are in the given layout if the
+            N persons (N = 1 for one person without the first axis). Their points are in the given layout if the
             model completes all of its points, else in the model's; ``Lifted.layout`` names it.
 
         Raises:
             InputError: an argument has a wrong shape, type or value.
-            LayoutError: the layout does not exist or shares fewer than 3 points with the model's.
+            LayoutError: the layout does not exist, is malformed, or shares fewer than 3 points with the model's.
         """
         if layout is None:
             xy, seen = as_points(points, visible, self.model.layout)
@@ -207,7 +211,7 @@ class Lifter:
     def _as_seen(self, fit: ShapeFit, pinhole: bool) -> np.ndarray:
         """Return shapes (N,3,P) in the virtual cameras' frames, with points moved sideways to where they were seen.
 
-        This is S_cam = [W; z] of the paper's equation 4, as far as a detector can be trusted.  Points within two
+        This is S_cam = [W; z] of the paper's equation 4, as far as a detector can be trusted. Points within two
         standard deviations of the model's misfit move all the way; the farther others are, the less they move.
         """
         shape = fit.R @ fit.S
@@ -221,7 +225,7 @@ class Lifter:
     def _place_midpoints(self, shape: np.ndarray, used: np.ndarray) -> None:
         """Move midpoints in shapes (N,3,P), in place, to the mean of their two points.
 
-        So the root of a person is in the middle of its hips.  A midpoint that was seen stays if one of its two points
+        So the root of a person is in the middle of its hips. A midpoint that was seen stays if one of its two points
         was not, for instance a pelvis beside a hidden hip.
         """
         point, parts = self._midpoints

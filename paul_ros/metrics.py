@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Error measures of the lifting and NRSfM literature, each under its exact name.
 
-All take predictions and ground truth as points (N,P,3) in the camera frame, in equal units.  They return errors (N,),
-one a shape, in those units; NE is a ratio.  Both sets are first centred on their mean, so no measure sees absolute
+All take predictions and ground truth as points (N,P,3) in the camera frame, in equal units. They return errors (N,),
+one a shape, in those units; NE is a ratio. Both sets are first centred on their mean, so no measure sees absolute
 position.
 
 >>> import numpy as np
@@ -38,7 +38,7 @@ def mpjpe(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def mpjpe_flip_frame(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return the MPJPE of C3DPO (Novotny et al., ICCV 2019): the better of the original and the depth-flipped shape.
 
-    C3DPO removes the mean depth only.  Here x and y are centred too, which changes nothing if all points are seen,
+    C3DPO removes the mean depth only. Here x and y are centred too, which changes nothing if all points are seen,
     because a fitted prediction is centred already.
     """
     return np.minimum(mpjpe(predicted, truth), mpjpe(flip_depth(predicted), truth))
@@ -62,7 +62,7 @@ def pa_mpjpe(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def fill_absent(points: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Replace absent points by the mean of the present ones.
 
-    If this is done to prediction and truth alike, an absent point moves no centre and has no error.  A mean over P
+    If this is done to prediction and truth alike, an absent point moves no centre and has no error. A mean over P
     points must then be divided by ``present.mean(1)``.
 
     Args:
@@ -97,7 +97,7 @@ def normalised_error(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def normalised_error_o3(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return the error of Deep NRSfM (Kong and Lucey, ICCV 2019): NE after scaling and O(3) alignment.
 
-    Predictions are scaled to the truth's norm.  Reflections are allowed, so this error ignores mirrored frames and
+    Predictions are scaled to the truth's norm. Reflections are allowed, so this error ignores mirrored frames and
     wrong cameras, and is far milder than NE.
     """
     predicted, truth = _centred(predicted), _centred(truth)

@@ -57,7 +57,7 @@ class Model:
 
     @property
     def scale(self) -> str:
-        """``free``: every frame is normalised by its own size.  ``unit``: orthographic data of one fixed scale."""
+        """``free``: every frame is normalised by its own size. ``unit``: orthographic data of one fixed scale."""
         return self.header.get("scale", "free")
 
     @property
@@ -75,7 +75,7 @@ class Model:
         """Return codes phi = h(W, M).
 
         Args:
-            W: (N,2,P) image points, anywhere in the image; any value where hidden.  The unit is free if ``scale`` is
+            W: (N,2,P) image points, anywhere in the image; any value where hidden. The unit is free if ``scale`` is
                 ``free``, else it is that of the training data.
             visible: (N,P) bool.
 

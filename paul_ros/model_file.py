@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model file: load, check, save.
 
-A model file is an ``.npz`` archive of float32 weights, the mean shape and one JSON header.  Its last 64 bytes (the zip
-comment) are the SHA-256 of all bytes before them, so that every change to the file is detected.  Nothing is unpickled.
+A model file is an ``.npz`` archive of float32 weights, the mean shape and one JSON header. Its last 64 bytes (the zip
+comment) are the SHA-256 of all bytes before them, so that every change to the file is detected. Nothing is unpickled.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def upright(W: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
     Args:
         W: (N,2,P) image points.
-        axes: (2,P) weights.  The sum of points under the first comes to point along y; under the second its x is
+        axes: (2,P) weights. The sum of points under the first comes to point along y; under the second its x is
             positive.
     """
     direction = W @ axes[0]
@@ -94,8 +94,8 @@ def to_centre(S: np.ndarray, layout: Layout) -> np.ndarray:
 def to_unit_size(S: np.ndarray, layout: Layout) -> np.ndarray:
     """Centre shapes (N,3,P) and scale them to model units, in each category.
 
-    The size of a shape seen by weak perspective is free.  If the layout has edges, their mean length is 1, because
-    bones keep their lengths when a body moves.  Otherwise the rms distance of the points to their mean is 1.
+    The size of a shape seen by weak perspective is free. If the layout has edges, their mean length is 1, because
+    bones keep their lengths when a body moves. Otherwise the rms distance of the points to their mean is 1.
     """
     sized = np.empty_like(S)
     for part in layout.parts:

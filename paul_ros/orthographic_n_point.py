@@ -4,8 +4,8 @@
 The function ``onp`` minimises ``sum_j w_j |s R_xy S_j + t - W_j|^2`` over rotations R, translations t and, in the
 free-scale problem, s > 0.
 
-The page ``docs/explanation/onp.md`` reduces this to a smooth function on the sphere of viewing directions.  It also
-derives the proof of global optimality.  The module ``paul_ros.viewing_sphere`` has the solver, and
+The page ``docs/explanation/onp.md`` reduces this to a smooth function on the sphere of viewing directions. It also
+derives the proof of global optimality. The module ``paul_ros.viewing_sphere`` has the solver, and
 ``paul benchmark onp`` measures it.
 """
 
@@ -26,23 +26,23 @@ _EXACT = 1e-6  # share of the image's extent: costs are exact to 1e-16, so resid
 class OnP(NamedTuple):
     """Optimal poses of N shapes, with the strongest rival of each.
 
-    ``W ~ scale * R[:, :2] @ S + translation``.  Image units are those of W.
+    ``W ~ scale * R[:, :2] @ S + translation``. Image units are those of W.
 
     Attributes:
         R: (N,3,3) rotations, canonical frame to camera frame (third axis along the view), det +1.
         scale: (N,) image units per shape unit (1 in the unit-scale problem).
         translation: (N,2) image units.
         residual: (N,) weighted root mean square distance to W, image units.
-        certified: (N,) bool, the pose is proven to be the global optimum, up to rounding.  No other pose lowers the
-            mean squared distance by more than 1e-10 of the image's mean square about its mean.  In the unit-scale
-            problem this share refers to image and shape together.  For shapes next to needles or balls and images
+        certified: (N,) bool, the pose is proven to be the global optimum, up to rounding. No other pose lowers the
+            mean squared distance by more than 1e-10 of the image's mean square about its mean. In the unit-scale
+            problem this share refers to image and shape together. For shapes next to needles or balls and images
             next to lines, rounding makes it 1e-7.
         determined: (N,) bool, the points fix a pose; otherwise R is the identity and scale 0 (1 in the unit-scale
-            problem).  They fix none if fewer than three are given, if all are on one line, or if shape and image are
-            uncorrelated.  Extents must be at least 1e-12 of the distance from the origin, and from 1e-70 to 1e150.
+            problem). They fix none if fewer than three are given, if all are on one line, or if shape and image are
+            uncorrelated. Extents must be at least 1e-12 of the distance from the origin, and from 1e-70 to 1e150.
             Coordinates and weights must be finite, and weights not negative.
         two_fold: (N,) bool, a second, depth-reversed optimum was found, and its viewing direction is more than 0.05
-            radians from the first.  At most 0.4 % of the existing ones are missed (docs/explanation/onp.md).
+            radians from the first. At most 0.4 % of the existing ones are missed (docs/explanation/onp.md).
         R_mirror, scale_mirror, translation_mirror, residual_mirror: the second optimum; without one, the Necker
             reversal of the first (its reflection about the axis along which the shape is thinnest).
         extent: (N,) weighted root mean square distance of the image points from their mean, image units.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose of known shapes under a true pinhole camera, refined from a weak-perspective start.
 
-Weak perspective takes all points of a person to be as far away as the person's middle.  At 2 m this costs 10 cm and
-more, and a person seen from above gets a wrong slant.  Orthographic-N-point gives the start, the proven optimum of
-weak perspective.  Levenberg-Marquardt steps from there lower the error of the pinhole camera.
+Weak perspective takes all points of a person to be as far away as the person's middle. At 2 m this costs 10 cm and
+more, and a person seen from above gets a wrong slant. Orthographic-N-point gives the start, the proven optimum of
+weak perspective. Levenberg-Marquardt steps from there lower the error of the pinhole camera.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def refine(S: np.ndarray, W: np.ndarray, visible: np.ndarray, R: np.ndarray, T: 
 class _State(NamedTuple):
     """Poses of N shapes and their errors.
 
-    Hidden points are infinitely far away, so their image is the origin.  W has them there too: they add nothing.
+    Hidden points are infinitely far away, so their image is the origin. W has them there too: they add nothing.
 
     Attributes:
         R: (N,3,3) rotations.
@@ -101,7 +101,7 @@ def _choose(better: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray
 def _step(pose: _State, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rotations (N,3,3) and shifts (N,3) of one damped Gauss-Newton step.
 
-    A shift t and a turn about a vector a move a point Y + T by m = t + a x Y.  With d the inverse depth, its image
+    A shift t and a turn about a vector a move a point Y + T by m = t + a x Y. With d the inverse depth, its image
     (u, v) moves by d (m_xy - (u, v) m_z).
     """
     N, _, P = pose.Y.shape

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Placement: from pixels to rays, and from shape units to metres in the camera frame.
 
-Weak perspective is exact on the optical axis only, but people stand beside it.  So a virtual camera is turned towards
-each person: the rays of the keypoints are rotated until the person's direction is the optical axis.  The person is
-lifted there (``paul_ros.pinhole_pose`` adds the remaining perspective), and the result is rotated back.  With scale
+Weak perspective is exact on the optical axis only, but people stand beside it. So a virtual camera is turned towards
+each person: the rays of the keypoints are rotated until the person's direction is the optical axis. The person is
+lifted there (``paul_ros.pinhole_pose`` adds the remaining perspective), and the result is rotated back. With scale
 ``s`` (normalised image units per model unit) and ``m`` metres per model unit, similar triangles give the distance
 ``m / s``.
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Routes of keypoints: from the detector's layout to the model's, and on to the layout of the output.
 
-Points are matched by name, so one model serves every detector whose points it has.  Other points are hidden to the
+Points are matched by name, so one model serves every detector whose points it has. Other points are hidden to the
 model, and the model completes them.
 """
 

@@ -14,7 +14,7 @@ from paul_ros.pinhole_pose import refine
 
 _WILD_MEDIANS, _WILD_EXTENT = 3.0, 0.35
 """Limits of misses, in medians of the person's points and as a share of the person's extent (about 11 % of the
-height).  A point that exceeds both is a misdetection."""
+height). A point that exceeds both is a misdetection."""
 
 
 class ShapeFit(NamedTuple):

@@ -2,14 +2,14 @@
 """The goal of orthographic-N-point over viewing directions n, its derivatives, and Newton's climb to a maximum.
 
 In the principal axes of the shape, with image points as complex numbers, everything is a sum over three components.
-The page ``docs/explanation/onp.md`` has the derivation.  With ``u = e1 + i e2`` a right-handed frame of the plane
+The page ``docs/explanation/onp.md`` has the derivation. With ``u = e1 + i e2`` a right-handed frame of the plane
 across n and ``*`` for complex conjugates,
 
     E = sum a n^2        z = sum u* d        T = |z|^2
     unit scale: g = k E + 2 (1 - k) sqrt(T)
     free scale: g = T / (1 - E)
 
-A tangent step is a complex number s, to ``n + Re(s* u)``.  The slope of g is then complex.  Its Hessian maps s to
+A tangent step is a complex number s, to ``n + Re(s* u)``. The slope of g is then complex. Its Hessian maps s to
 ``m s + w s*`` with m real and w complex (eigenvalues m - |w| and m + |w|).
 """
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Orthographic-N-point, reduced to the viewing direction n and solved on the sphere of directions.
 
-The module ``paul_ros.viewing_goal`` has the goal g(n) and the climb.  The best pose that looks along n is
-``r1 + i r2 = u z/|z|``, and the best n has the largest g.  The page ``docs/explanation/onp.md`` derives this
+The module ``paul_ros.viewing_goal`` has the goal g(n) and the climb. The best pose that looks along n is
+``r1 + i r2 = u z/|z|``, and the best n has the largest g. The page ``docs/explanation/onp.md`` derives this
 and proves the certificate.
 """
 
@@ -253,10 +253,13 @@ def _with_rival(xp: Kind, problem: Problem, best: View, other: View, scale: Scal
 
 
 def start_direction(xp: Kind, problem: Problem) -> Vector:
-    """Return the direction of least squares along the two thick axes and of a rotation along the thin one.
+    """Return a cheap estimate of the best direction, where the climb starts.
 
-    Rotations have q^T q = 0 for q = s (r1 + i r2).  This leaves two roots for q_0, Necker reversals of each other.
-    Least squares gives d_0 / a_0, which is all noise if a_0 is small and then only chooses the root.  The thinner the
+    Along the two thick axes of the shape it is the least-squares solution. Along the thin axis it satisfies the
+    constraint of a rotation.
+
+    Rotations have q^T q = 0 for q = s (r1 + i r2). This leaves two roots for q_0, Necker reversals of each other.
+    Least squares gives d_0 / a_0, which is all noise if a_0 is small and then only chooses the root. The thinner the
     shape, the more the start relies on the root.
     """
     (a0, a1, a2), (d0, d1, d2) = problem.a, problem.d
@@ -270,8 +273,8 @@ def start_direction(xp: Kind, problem: Problem) -> Vector:
 def is_certified(xp: Kind, problem: Problem, view: View, scale: Scale) -> Number:
     """Return whether a direction is proven to be the best of all, up to ``_SLACK`` of g.
 
-    A quadratic n^T K n + 2 h.n bounds g from above and touches it here.  It has no higher point on the sphere if
-    lambda - K is positive semidefinite, with lambda = n^T K n + h.n (More and Sorensen, 1983).  This holds if no
+    A quadratic n^T K n + 2 h.n bounds g from above and touches it here. It has no higher point on the sphere if
+    lambda - K is positive semidefinite, with lambda = n^T K n + h.n (More and Sorensen, 1983). This holds if no
     coefficient of the characteristic polynomial is negative.
     """
     of_A, of_T = 1.0, 1 / (view.g + TINY)

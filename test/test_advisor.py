@@ -77,5 +77,8 @@ def test_model_units_and_a_clock_that_was_set_back(advisor, lines):
     advisor.report_model_units("none: no usable CameraInfo has come")
     advisor.report_model_units("none: no usable CameraInfo has come")
     advisor.report_clock_set_back(95.0)
-    assert "model units" in lines[0] and "no usable CameraInfo" in lines[0]
+    assert lines[0] == (
+        "points are in model units, not metres: no usable CameraInfo has come. "
+        "Remap `camera_info` to a calibrated camera."
+    )
     assert lines[1:] == ["time was set back by 95.0 s"]

@@ -211,6 +211,17 @@ def _camera(**changes: object) -> types.SimpleNamespace:
     return types.SimpleNamespace(**{**info, **changes})
 
 
+@pytest.mark.parametrize("height", [-1.7, float("nan"), float("inf"), "tall"])
+def test_a_height_that_nobody_has_is_refused(height: object) -> None:
+    with pytest.raises(PaulError, match="person_height is .*: pass metres"):
+        Lifter("human", person_height=height)
+
+
+def test_a_layout_is_asked_for_by_name_or_path() -> None:
+    with pytest.raises(PaulError, match="layout is a int: pass a name"):
+        load_layout(17)
+
+
 @pytest.mark.parametrize(
     "arguments, advice",
     [
@@ -239,6 +250,12 @@ def _camera(**changes: object) -> types.SimpleNamespace:
         ({"camera": FOCAL}, r"shape \(\): pass Intrinsics"),
         ({"camera": "camera.yaml"}, "camera of type str cannot be an array"),
         ({"camera": _camera(k=[0.0] * 9)}, "calibrate the camera"),
+        ({"camera": _camera(p=[0.0])}, "no sensor_msgs/CameraInfo"),
+        ({"visible": [[True] * 17, [True]]}, "visible cannot be an array"),
+        (
+            {"points": POINTS[0], "layout": "coco17", "visible": np.ones((1, 17), bool)},
+            r"visible has shape \(1, 17\), points \(17, 2\) need \(17,\)",
+        ),
     ],
 )
 def test_wrong_arguments_are_refused_with_advice(lifter: Lifter, arguments: dict, advice: str) -> None:

@@ -124,6 +124,15 @@ def test_what_is_no_measure_of_the_person_changes_nothing(stream, make, metres, 
     assert ("Remap `depth`" in str(stream.ledger.advice)) == ("depth_of_another_size" in note)
 
 
+@pytest.mark.parametrize("size, used", [(0.39, False), (0.41, True), (1.39, True), (1.41, False)])
+def test_a_depth_is_used_from_0_4_to_1_4_times_the_size(stream, make, size, used):
+    """What is measured is the skin, 0.12 m before the root."""
+    plain = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame.lifted.root[0, 2]
+    stream.depth(depth_image(make, np.full((480, 640), size * plain - 0.12)))
+    measured = stream.keypoints(CLOUD, cloud(make, seen(two()))).frame.lifted.root[0, 2]
+    assert measured == pytest.approx((size if used else 1) * plain, rel=1e-5)
+
+
 def test_only_the_image_of_that_time_counts(stream, make):
     truth = two(0.7)
     stream.depth(depth_image(make, background(truth)))
@@ -166,6 +175,13 @@ def test_images_of_before_the_clock_was_set_back_are_forgotten(stream, make):
     stream.depth(depth_image(make, background(two()), header=header_of(make, seconds=7)))
     stream.keypoints(CLOUD, cloud(make, seen(two()), seconds=9))
     assert stream.ledger.notes == {"depth_of_another_time": 1}
+
+
+def test_images_may_come_out_of_order(stream, make):
+    stream.depth(depth_image(make, background(two()), header=header_of(make, seconds=9)))
+    stream.depth(depth_image(make, background(two()), header=header_of(make, seconds=8, nanoseconds=500_000_000)))
+    stream.keypoints(CLOUD, cloud(make, seen(two()), seconds=9))
+    assert stream.ledger.notes == {"depth_used": 2}
 
 
 def test_the_root_of_a_thing_lies_on_its_visible_surface(model_file, make):

@@ -139,6 +139,7 @@ def test_a_qos_that_does_not_match_is_a_warning_once(health, stream):
 
 def test_model_units_are_a_warning_where_the_model_knows_metres(health, stream):
     stream.session.intrinsics = None
+    assert "no metres" not in health.report(100.5, stream).message, "before a frame was lifted"
     run(health)
     report = health.report(101.0, stream)
     assert report.level == WARN and "no metres" in report.message
@@ -161,6 +162,7 @@ def test_rates_are_of_the_time_since_the_last_report(health, stream):
 def test_latency_is_known_if_the_clocks_agree(health, stream):
     health.published(frame(stamp=50 * S), 3 * S)  # from the future
     health.published(frame(stamp=0), 1_700_000_000 * S)  # a bag of long ago
+    health.published(frame(stamp=S), 11 * S + 1)  # older than 10 s
     values = health.report(101.0, stream).values
     assert values["latency_ms_median"] == values["latency_ms_p99"] == "unknown"
     for ms in range(1, 102):
@@ -172,7 +174,7 @@ def test_latency_is_known_if_the_clocks_agree(health, stream):
 
 
 def test_shares_are_of_the_persons_lifted(health, stream):
-    health.published(frame(certified=(True, False, False), ambiguity=(0.95, 0.2, np.nan)), S)
+    health.published(frame(certified=(True, False, False), ambiguity=(0.9, 0.89, np.nan)), S)
     health.published(frame(certified=(True, True), ambiguity=(0.1, 0.0)), S)
     health.published(frame(certified=(), ambiguity=()), S)
     values = health.report(101.0, stream).values

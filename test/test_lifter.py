@@ -318,6 +318,15 @@ def test_points_that_miss_by_more_than_35_percent_of_the_extent_are_misdetection
     assert np.delete(used, 11, axis=1).all()
 
 
+def test_in_a_bad_fit_only_points_that_miss_by_more_than_3_medians_are_misdetections(exact_lifter):
+    W, visible = PERSON.T[None, :2], np.ones((1, 17), bool)
+    fit = shape_fit._fit(exact_lifter.model, W, visible, pinhole=False)
+    missed = np.full((1, 17), 0.2)
+    missed[0, 4], missed[0, 9] = 0.59, 0.61
+    wild = shape_fit._misdetections(fit._replace(square=missed**2, extent=np.ones(1)))
+    assert np.flatnonzero(wild[0]).tolist() == [9]
+
+
 def test_points_that_all_fit_are_all_used(exact_lifter):
     """Noise of a hundredth of a pixel makes no misdetections, however its sizes differ."""
     truth = np.repeat(persons_at((0, 0, 4)), 50, axis=0)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import pytest
 
 from paul_ros.errors import BagError, OutputError
+from paul_ros.files import atomic_file, write_atomically
 from paul_ros.output_files import check_output, check_outputs
 
 
@@ -47,3 +48,14 @@ def test_the_folder_of_an_output_is_made(tmp_path):
 
 def test_an_output_error_is_no_bag_error():
     assert not issubclass(OutputError, BagError)
+
+
+def test_an_error_of_writing_names_the_file_and_not_the_temporary_one(tmp_path):
+    out, absent = tmp_path / "folder", tmp_path / "absent"
+    out.mkdir()
+    with pytest.raises(IsADirectoryError) as refusal:
+        write_atomically(out, b"data")
+    assert refusal.value.filename == str(out) and list(tmp_path.iterdir()) == [out]
+    with pytest.raises(FileNotFoundError) as refusal, atomic_file(tmp_path / "file"):
+        absent.read_bytes()
+    assert refusal.value.filename == str(absent) and list(tmp_path.iterdir()) == [out]

@@ -428,6 +428,8 @@ def test_unknown_parameters_are_refused(model_file, name, advice):
 def test_parameters_out_of_their_limits_are_refused(model_file):
     with pytest.raises(ParameterError, match="person_height is -1.0.*0 or 0.3 to 3.0"):
         open_stream(str(model_file), person_height=-1.0)
+    with pytest.raises(ParameterError, match="smoothing is '5'; it must be 0.0 to 100.0"):
+        open_stream(str(model_file), smoothing="5")
 
 
 @pytest.mark.parametrize("height, taken", [(0.0, True), (0.3, True), (3.0, True), (1e-9, False), (0.29, False)])

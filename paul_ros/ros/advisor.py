@@ -70,7 +70,10 @@ class Advisor:
 
     def report_model_units(self, reason: str) -> None:
         """Warn that points are in model units; the reason is the stream's description of its scale."""
-        text = f"points are in model units, not metres (scale: {reason}). Remap `camera_info` to a calibrated camera."
+        text = (
+            f"points are in model units, not metres: {reason.removeprefix('none: ')}. "
+            "Remap `camera_info` to a calibrated camera."
+        )
         self._log("units", text, NOTE_SECONDS)
 
     def report_clock_set_back(self, seconds: float) -> None:

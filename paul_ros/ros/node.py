@@ -65,7 +65,7 @@ class LifterNode(LifecycleNode):
 
     @property
     def stream(self) -> LiftStream:
-        """The stream of a configured node."""
+        """The stream of a configured node; raises RuntimeError if the node is not configured."""
         return self.pipeline.stream
 
     @property

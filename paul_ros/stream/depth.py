@@ -22,8 +22,8 @@ SURFACE = 0.12
 Source: buttock depth in Gordon et al., 2012 Anthropometric Survey of U.S. Army Personnel, 2014."""
 
 SIGMA = 0.08
-"""Metres, standard deviation of SURFACE: hips seen from the side are half as broad as deep again, and clothes and arms
-cover them."""
+"""Metres, standard deviation of SURFACE. Hips are 1.5 times as broad as deep, so their middle lies farther behind the
+skin of a person who stands sideways. Clothes and arms before the hips add to it."""
 
 SIZES = (0.4, 1.4)
 """Limits of a person's size over the model's size. A depth that implies another size is ignored."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numbers
 import textwrap
 from dataclasses import dataclass
 from typing import Any
@@ -41,11 +42,12 @@ class Parameter:
         return f"{low} to {high}" if self.least is None else f"{low:g} or {self.least} to {high}"
 
     def allows(self, value: Any) -> bool:
-        """Return whether a value of the right type is in range."""
+        """Return whether a value is a number in range; without limits any value is allowed."""
         if self.limits is None:
             return True
         low, high = self.limits
-        return low <= value <= high and (self.least is None or value == low or value >= self.least)
+        is_number = isinstance(value, numbers.Real)
+        return is_number and low <= value <= high and (self.least is None or value == low or value >= self.least)
 
 
 PARAMETERS = (
@@ -122,7 +124,7 @@ def checked(values: dict[str, Any]) -> dict[str, Any]:
     """Return the values by name with the defaults of all others.
 
     Raises:
-        ParameterError: a name is unknown, or a number is out of its range.
+        ParameterError: a name is unknown, or a number is out of its range or no number.
     """
     for name in values.keys() - DEFAULTS.keys():
         import difflib  # its import would cost the node 9 ms at every start
@@ -133,7 +135,7 @@ def checked(values: dict[str, Any]) -> dict[str, Any]:
     for parameter in PARAMETERS:
         value = values.get(parameter.name, parameter.default)
         if not parameter.allows(value):
-            raise ParameterError(f"{parameter.name} is {value}; it must be {parameter.range}")
+            raise ParameterError(f"{parameter.name} is {value!r}; it must be {parameter.range}")
     return {**DEFAULTS, **values}
 
 
