@@ -16,7 +16,7 @@ def require(extra: str, *modules: str) -> None:
         modules: import names that the caller is about to use.
 
     Raises:
-        MissingPackageError: a package is not installed.  The text names it and the command that installs it.
+        MissingPackageError: a package is not installed. The text names it and the command that installs it.
     """
     for module in modules:
         try:

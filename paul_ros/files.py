@@ -57,7 +57,7 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """Open a file for writing that is complete or unchanged when the block ends; missing folders are made.
 
     Raises:
-        OSError: the file cannot be written.  The error names the file, also if the disk is full.
+        OSError: the file cannot be written. The error names the file, also if the disk is full.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

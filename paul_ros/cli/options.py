@@ -85,7 +85,7 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
 
 
 def add_runs(parser: argparse.ArgumentParser) -> None:
-    """Add the options of commands that train many times; `run_keeping` reads them."""
+    """Add the options of commands that train many times."""
     parser.add_argument(
         "--seeds", metavar="N", type=positive, default=3, help="number of runs of each case (default: %(default)s)"
     )
