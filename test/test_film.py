@@ -161,6 +161,19 @@ def test_without_a_camera(tmp_path, model_file, drawn):
     assert len(drawn) == 2 and has(drawn[0], LEFT) > 200
 
 
+def test_without_a_camera_and_nobody_at_first(tmp_path, drawn):
+    """The layout of the input shows with the first person; the images before have the points of the model."""
+    bag = make_bag(
+        tmp_path / "late.mcap",
+        2,
+        rate=10,
+        persons=lambda index: persons_at((0.3, 0, 4)) if index else np.empty((0, 17, 3)),
+        camera=False,
+    )
+    film.view_bag(bag, open_stream(), tmp_path / "f.gif")
+    assert len(drawn) == 2 and not has(drawn[0][35:400], LEFT) and has(drawn[1], LEFT) > 200
+
+
 def test_the_turntable():
     np.testing.assert_allclose(turntable(0.3) @ turntable(0.3).T, np.eye(3), atol=1e-12)
     up = turntable(1.0) @ np.array([0, -1.0, 0])

@@ -127,7 +127,7 @@ def _cause(error: Exception) -> str:
     from mcap.exceptions import RecordLengthLimitExceeded
 
     if isinstance(error, RecordLengthLimitExceeded):
-        return "a record is longer than the file"
+        return "the file ends too early, or the length of a record is damaged"
     return str(error) or type(error).__name__
 
 
