@@ -295,7 +295,7 @@ def test_another_order_of_the_keypoints_is_noted(persons, tmp_path, capsys):
     order = np.random.default_rng(0).permutation(17)
     swapped = npz(tmp_path / "in.npz", keypoints=persons[:, order])
     assert lift(swapped, tmp_path / "out.npz", "human", "--intrinsics", *CAMERA) == 0
-    assert "hardly look like a shape of the model" in capsys.readouterr().out
+    assert "no shape of the model fits" in capsys.readouterr().out
 
 
 # --- cameras

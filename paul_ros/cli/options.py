@@ -73,7 +73,7 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--topic",
         default="/keypoints",
-        help="topic of the 2D keypoints; * matches any part of a name, as in '/humans/bodies/*/skeleton2d' "
+        help="topic of the 2D keypoints; * matches any one part of a name, as in '/humans/bodies/*/skeleton2d' "
         "(default: %(default)s)",
     )
     parser.add_argument(
