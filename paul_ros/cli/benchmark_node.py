@@ -59,7 +59,7 @@ def add_parser(subjects: Commands) -> None:
         "--soak",
         metavar="MINUTES",
         type=minutes,
-        help="instead run the lifter alone for so long, with the most persons and the highest rate; memory over time",
+        help="instead run the lifter alone for this long, with the most persons and the highest rate; memory over time",
     )
     add_json(parser, "all rows")
     add_plot(parser, "latencies and CPU times, or memory")
