@@ -158,6 +158,30 @@ def test_a_message_that_the_end_cuts_is_not_read(unchunked):
     assert len(set(counts)) > 2
 
 
+@pytest.mark.parametrize(
+    "described, clue", [((), "a message is of channel 1, which"), (("channel",), "/poses has no schema")]
+)
+def test_a_message_that_the_file_does_not_describe(described, clue, tmp_path):
+    path = tmp_path / "odd.mcap"
+    with open(path, "wb") as file:
+        writer = McapWriter(file, use_chunking=False, enable_crcs=False)
+        writer.start("ros2", "an odd recorder")
+        if described:
+            writer.register_channel("/poses", "cdr", 0)
+        writer.add_message(1, 0, bytes(8), 0)
+        writer.finish()
+    found, error = read_until_damage(path)
+    assert not found and error is not None and f"damaged after 0 whole messages ({clue}" in str(error)
+
+
+def test_a_length_that_no_file_can_hold(unchunked):
+    damaged = bytearray(unchunked.read_bytes())
+    damaged[9:17] = (10**9).to_bytes(8, "little")  # of the header, the first record
+    unchunked.write_bytes(damaged)
+    _, error = read_until_damage(unchunked)
+    assert "the length of a record is damaged" in str(error)
+
+
 def test_bytes_after_the_end_are_noticed(unchunked):
     with open(unchunked, "ab") as file:
         file.write(b"x")

@@ -39,7 +39,6 @@ _BLOCK = re.compile(
     r"^(?:<!-- run(?P<with>.*?) -->\n|`(?P<file>[^`\n]+)`\n\n)?```(?P<kind>\w+)\n(?P<text>.*?)^```\n", re.M | re.S
 )
 _INLINE = re.compile(r"`(paul \w[^`]*)`")
-_BESIDE = re.compile(r"(?<=\S) {2,}.*")  # what a line of `--help` says of the example before it
 #: Topics that may be remapped, and what a node's own name is remapped by.
 TOPICS = {"keypoints", "camera_info", "depth", "__node", "__ns"}
 #: Words in place of something that a user has.
@@ -87,8 +86,8 @@ def shell_lines(page: Path) -> list[str]:
 
 
 def help_lines(page: Path) -> list[str]:
-    """Examples of `--help`, without what stands beside them."""
-    return [_BESIDE.sub("", line) for line in lines(page, "text") if line.startswith("  paul ")]
+    """Examples of `--help`."""
+    return [line for line in lines(page, "text") if line.startswith("  paul ")]
 
 
 def inline(page: Path) -> list[str]:

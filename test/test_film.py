@@ -104,7 +104,7 @@ def test_a_part_of_a_bag(tmp_path, model_file, drawn):
 
 def test_no_keypoints_then(tmp_path, model_file):
     bag = make_bag(tmp_path / "short.mcap", 3)
-    with pytest.raises(BagError, match="no keypoints from 9 s on"):
+    with pytest.raises(BagError, match="no keypoints after 9 s; `paul inspect`"):
         film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif", start=9.0)
 
 
@@ -159,6 +159,19 @@ def test_without_a_camera(tmp_path, model_file, drawn):
     bag = make_bag(tmp_path / "pixels.mcap", 2, rate=10, camera=False)
     film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif")
     assert len(drawn) == 2 and has(drawn[0], LEFT) > 200
+
+
+def test_without_a_camera_and_nobody_at_first(tmp_path, drawn):
+    """The layout of the input shows with the first person; the images before have the points of the model."""
+    bag = make_bag(
+        tmp_path / "late.mcap",
+        2,
+        rate=10,
+        persons=lambda index: persons_at((0.3, 0, 4)) if index else np.empty((0, 17, 3)),
+        camera=False,
+    )
+    film.view_bag(bag, open_stream(), tmp_path / "f.gif")
+    assert len(drawn) == 2 and not has(drawn[0][35:400], LEFT) and has(drawn[1], LEFT) > 200
 
 
 def test_the_turntable():

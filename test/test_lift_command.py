@@ -225,6 +225,15 @@ def test_persons_in_json_as_objects_or_flat(written, persons, model_file, tmp_pa
     assert lifted["person"].tolist() == (["ada", "1"] if written == "ids" else ["0", "1"])
 
 
+def test_an_id_that_utf8_cannot_hold(persons, model_file, tmp_path):
+    """JSON allows half a surrogate pair."""
+    source = tmp_path / "in.json"
+    source.write_text(json.dumps([[{"id": "\ud800", "keypoints": persons[0].tolist()}]]))
+    for kind in ("npz", "csv", "json"):
+        assert lift(source, tmp_path / f"out.{kind}", model_file) == 0
+    assert "0,\\ud800,nose," in (tmp_path / "out.csv").read_text()
+
+
 def test_persons_of_one_frame_in_csv(persons, model_file, tmp_path):
     """Rows of a frame may come in any order."""
     rows = [f"5,{name},{k},{x},{y}" for name in "ab" for k, (x, y) in zip(COCO, persons["ab".index(name) * 2])]
@@ -286,7 +295,7 @@ def test_another_order_of_the_keypoints_is_noted(persons, tmp_path, capsys):
     order = np.random.default_rng(0).permutation(17)
     swapped = npz(tmp_path / "in.npz", keypoints=persons[:, order])
     assert lift(swapped, tmp_path / "out.npz", "human", "--intrinsics", *CAMERA) == 0
-    assert "hardly look like a shape of the model" in capsys.readouterr().out
+    assert "no shape of the model fits" in capsys.readouterr().out
 
 
 # --- cameras
@@ -327,6 +336,8 @@ def test_distortion_without_a_rectified_image_is_noted(persons, model_file, tmp_
         ("name: x", "has neither K (camera_matrix) nor P"),
         ("K: [1, 2, 3]", "camera_matrix has 3 numbers, it must have 9"),
         ("K: 900", "not a list of numbers"),
+        (f"K: [{10**400}]", "not a list of numbers"),
+        ("date: 2020-99-99", "neither YAML nor JSON"),
         ("K: {rows: 3}", "not a list of numbers"),
         ("K: [.nan, 0, 1, 0, 1, 1, 0, 0, 1]", "not finite"),
         ("K: [1, 0, 0.5, 0, 1, 0.5, 0, 0, 1]", "calibrate the camera"),
@@ -377,6 +388,7 @@ BAD = [
     ("csv", "", "lacks frame, keypoint, x, y in its columns (none): they must be frame,keypoint,x,y"),
     ("csv", CSV, "holds no keypoints: write rows of frame,keypoint,x,y"),
     ("csv", "frame,joint,x,y\n", "lacks keypoint in its columns (frame,joint,x,y)"),
+    ("csv", "frame,keypoint,x,y,X\n", "has the column x twice: keep one of them"),
     ("csv", CSV + "0,nose,1\n", "line 2 has 3 cells; it must have 4"),
     ("csv", CSV + "0,nose,1,2\n1,nose,left,2\n", "line 3: x is 'left'; it must be a number, or empty"),
     ("csv", CSV + "0.5,nose,1,2\n", "line 2: frame is '0.5'; it must be a whole number"),
@@ -414,6 +426,11 @@ BAD = [
     ("npz", {"keypoints": np.full((1, 17, 2), "a")}, "keypoints has type <U1; it must be number"),
     ("npz", {"keypoints": np.full((1, 17, 2), None)}, "pickled objects"),
     ("npz", {"keypoints": np.ones((2, 17, 2)), "visible": np.ones(17)}, "visible is (17,); it must be (2, 17)"),
+    (
+        "npz",
+        {"keypoints": np.ones((1, 17, 2)), "visible": np.full((1, 17), np.nan)},
+        "visible has values other than 0 and 1; save confidences as confidence",
+    ),
     ("npz", {"keypoints": np.ones((2, 17, 2)), "frame": np.ones(2)}, "frame has type float64; it must be integer"),
 ]
 

@@ -23,10 +23,11 @@ import numpy as np
 #: Names of the measured nodes, which read /NAME/keypoints and publish /NAME/poses.
 NODES = ("lifter", "echo")
 
-#: Record of the listener: index in NODES (-1 = ready), header.stamp of the output, and time of its arrival, both in ns.
+#: Record of the listener: index in NODES (-1 = ready), then header.stamp of the output and the time of its arrival,
+#: both in ns of the system's clock.
 ARRIVAL = np.dtype([("node", "<i8"), ("stamp", "<i8"), ("arrival", "<i8")])
 
-#: The stamp follows the four bytes that begin CDR, in a message that begins with a header.
+#: The stamp follows the four bytes that begin little-endian CDR, in a message that begins with a header.
 _STAMP = struct.Struct("<iI")
 _STAMP_AT = 4
 _SECOND = 10**9

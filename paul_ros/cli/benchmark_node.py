@@ -16,11 +16,12 @@ take turns of about two seconds.
 
 columns, a line for each number of persons, rate and node; times in µs:
   received: messages that a PoseArray answered, of those sent
-  median:   from the publisher's stamp to the arrival of the answer at the listener, which takes
-            serialised messages; then the 99th percentile
+  median:   from the publisher's stamp to the arrival of the answer at the
+            listener, which takes serialised messages; then the 99th percentile
   CPU:      time that all threads of the node's process used, per frame
   MB:       resident memory after the last frame
-  x echo:   the median over the echo node's; then the same for the 99th percentiles
+  x echo:   the median over the echo node's; then the same for the 99th
+            percentiles
   + CPU:    CPU time minus that of the echo node
 
 Start to first output counts from the start of the process, with a detector already running: median of three.
@@ -29,8 +30,10 @@ Other work on the machine spoils the figures: compare the load in the report.
 
 examples:
   paul benchmark node
-  paul benchmark node --persons 1,10 --rates 100 --seconds 30 --json node.json --plot node.png
-  paul benchmark node --soak 30 --persons 10 --rates 100     memory over half an hour
+  paul benchmark node --persons 1,10 --rates 100 --seconds 30 \\
+      --json node.json --plot node.png
+  paul benchmark node --soak 30 --persons 10 --rates 100
+                         memory over half an hour
 """
 
 
@@ -56,7 +59,7 @@ def add_parser(subjects: Commands) -> None:
         "--soak",
         metavar="MINUTES",
         type=minutes,
-        help="instead run the lifter alone for so long, with the most persons and the highest rate; memory over time",
+        help="instead run the lifter alone for this long, with the most persons and the highest rate; memory over time",
     )
     add_json(parser, "all rows")
     add_plot(parser, "latencies and CPU times, or memory")

@@ -28,8 +28,10 @@ after you change the program itself.
 
 examples:
   paul benchmark nrsfm --data nrsfm_short --json nrsfm.json --plot nrsfm.png
-  paul benchmark nrsfm --data nrsfm_short --sequences drink,yoga --methods paul,linear --seeds 20
-  paul benchmark nrsfm --data nrsfm_short --methods paul --hide 0.3 --set bottleneck=8
+  paul benchmark nrsfm --data nrsfm_short --sequences drink,yoga \\
+      --methods paul,linear --seeds 20
+  paul benchmark nrsfm --data nrsfm_short --methods paul --hide 0.3 \\
+      --set bottleneck=8
 """
 
 

@@ -14,15 +14,17 @@ optimum that a naive search finds. Then measure the 3D error if the shape is kno
 """
 _EPILOG = """\
 columns, a line for each scenario and method:
-  cases:    problems solved; lm_search is slow and solves only the first 200 of a scenario
+  cases:    problems solved; lm_search is slow and solves only the first 200
+            of a scenario
   cert. %:  share that is proven to be the global optimum (ours only)
   wrong:    number of proven ones that the naive search beats: must be 0
   missed:   number of poses with more than the best known residual
   better:   number of poses with less residual than ours
   angle:    degrees to the optimum: median, then 95th percentile
   ratio:    residual over that of the optimum: median, then the largest
-  µs:       time of one pose, called alone: best of several calls, median of several problems;
-            polar and majorise solve only batches, so this is mostly the price of NumPy's calls
+  µs:       time of one pose, called alone: best of several calls, median of
+            several problems; polar and majorise solve only batches, so this is
+            mostly the price of NumPy's calls
   µs batch: time of a pose in one call with --batch of them
   x lsq:    µs batch over that of lsq_svd
 
@@ -32,7 +34,8 @@ standard deviation of each image coordinate over the shape's rms radius / sqrt(3
 methods:
   ours:      paul_ros.onp
   lsq_svd:   least squares, then SVD (Wang and Lucey, CVPR 2021)
-  polar:     viewing direction of the affine fit, then Procrustes (polar factor) in its plane
+  polar:     viewing direction of the affine fit, then Procrustes (polar
+             factor) in the plane across it
   majorise:  200 steps of majorisation (Kiers; ten Berge) from lsq_svd
   lm_search: Levenberg-Marquardt from 8 spread rotations
 

@@ -15,16 +15,20 @@ _EPILOG = """\
 DATA is an npz with
   W:        (F,2,P) image points, y down; S and W share one scale
   S:        (F,3,P) the truth in the camera frame; NaN where it is unknown
-  visible:  (F,P) optional; the model sees visible points only, errors cover all points
+  visible:  (F,P) optional; the model sees visible points only, but errors
+            cover all points
   edges:    (E,2) optional, for the picture
-  metres:   optional; if true, distances are given in mm, otherwise in units of W
+  metres:   optional; if true, distances are given in mm, otherwise in the
+            units of W
 
 examples:
   paul evaluate person.npz unseen.npz --json errors.json --plot errors.png
-                         lifts every frame alone: encoder, decoder, orthographic-N-point
+                         lifts every frame alone: encoder, decoder,
+                         orthographic-N-point
   paul evaluate shapes.npz --truth drink.npz
-                         judges the shapes that `paul train --shapes shapes.npz` reconstructed;
-                         frames and their order must be those of the truth
+                         judges the shapes that `paul train --shapes
+                         shapes.npz` reconstructed; frames and their order must
+                         be those of the truth
 
 NE is |S - truth| / |truth| of the centred shapes, without alignment. Mirror images look alike under an
 orthographic camera: "flip per frame" may mirror each frame, "one flip for all" only the whole set.

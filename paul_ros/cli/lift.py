@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, BinaryIO
 from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_layout, add_person_height
 from paul_ros.cli.output import STDOUT, check_files, open_output
 from paul_ros.cli.progress import progress
+from paul_ros.stream.parameters import DEFAULTS
 
 if TYPE_CHECKING:
     from msg_adapters import Intrinsics
@@ -30,24 +31,27 @@ The points are in metres from the camera if a camera is given, otherwise in mode
 """
 _EPILOG = """\
 input, N persons of P keypoints in pixels (x right, y down), NaN where hidden:
-  npz:   keypoints (N,P,2), or (N,P,3) with the confidences, or W (F,2,P) as for `paul train`;
-         optional visible (N,P), confidence (N,P), frame (N,) and person (N,).
-  csv:   a row for each keypoint, with columns frame,keypoint,x,y and optional person,confidence.
-         A keypoint is a name or, with --layout, a number from 0 on. Rows are sorted by frame.
-         A keypoint is hidden if it has no row, or no x and y.
+  npz:   keypoints (N,P,2), or (N,P,3) with the confidences, or W (F,2,P) as
+         for `paul train`; optional visible (N,P), confidence (N,P), frame (N,)
+         and person (N,).
+  csv:   a row for each keypoint, with the columns frame,keypoint,x,y and
+         optional person,confidence. A keypoint is a name or, with --layout, a
+         number from 0 on. It is hidden if it has no row, or no x and y.
+         Sort the rows by frame.
   json:  a list of frames; a frame is a list of persons.
          A person is a list of keypoints, or {"id": "7", "keypoints": [...]}.
-         A keypoint is [x, y], [x, y, confidence] or null.
-         The keypoints may also be one flat list x, y, confidence, x, y, ... as in COCO.
+         A keypoint is [x, y], [x, y, confidence] or null. The keypoints may
+         also be one flat list x, y, confidence, x, y, ... as in COCO.
 
 output, in the optical frame of the camera (x right, y down, z forward):
   points:          (N,P,3), and root: (N,3)
   distance_sigma:  (N,) standard deviation of the root's distance in metres
-  ambiguity:       (N,) 0..1; near 1 the depth-reversed pose fits the image as well
+  ambiguity:       (N,) 0..1; near 1 the depth-reversed pose fits as well
   certified:       (N,) whether the pose is proven to be the optimum
   reason:          (N,) why a person was not lifted; empty if it was
   units:           `m` or `model`
-  stated too:      frame, person, layout, keypoints (their names), coordinate_frame, model
+  also:            frame, person, layout, keypoints (their names),
+                   coordinate_frame, model, model_sha256
 A csv has a row for each keypoint, with root_x, root_y, root_z. In json, `persons` is a list of
 objects.
 
@@ -102,7 +106,8 @@ def add_parser(commands: Commands) -> None:
         "--min-confidence",
         metavar="C",
         type=float,
-        help="keypoints with a lower confidence count as hidden (default: the node's, 0.3)",
+        default=DEFAULTS["min_confidence"],
+        help="keypoints with a lower confidence count as hidden, as in the node (default: %(default)s)",
     )
     parser.set_defaults(run=run, usage_error=parser.error)
 
@@ -192,7 +197,7 @@ def _notes(tally: Counter[str], camera: Intrinsics | None, layout: str) -> list[
         )
     if tally[_UNLIKE]:
         notes.append(
-            f"note: {tally[_UNLIKE]} persons hardly look like a shape of the model; if the keypoints are not in the "
+            f"note: no shape of the model fits {tally[_UNLIKE]} of the persons well; if the keypoints are not in the "
             f"order of layout {layout}, set --layout"
         )
     return notes

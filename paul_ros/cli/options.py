@@ -73,7 +73,7 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--topic",
         default="/keypoints",
-        help="topic of the 2D keypoints; * matches any part of a name, as in '/humans/bodies/*/skeleton2d' "
+        help="topic of the 2D keypoints; * matches any one part of a name, as in '/humans/bodies/*/skeleton2d' "
         "(default: %(default)s)",
     )
     parser.add_argument(
@@ -85,7 +85,7 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
 
 
 def add_runs(parser: argparse.ArgumentParser) -> None:
-    """Add the options of commands that train many times; `run_keeping` reads them."""
+    """Add the options of commands that train many times."""
     parser.add_argument(
         "--seeds", metavar="N", type=positive, default=3, help="number of runs of each case (default: %(default)s)"
     )

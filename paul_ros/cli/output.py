@@ -17,7 +17,7 @@ def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | No
     """Refuse outputs that cannot be written, or that would overwrite an input or each other, before any work is done.
 
     Raises:
-        BagError: names the file and what to do.
+        OutputError: names the file and what to do.
     """
     from paul_ros.output_files import check_outputs
 

@@ -62,7 +62,7 @@ def add_parser(commands: Commands) -> None:
         "--smoothing",
         type=float,
         metavar="HZ",
-        help="cut-off of a filter over time, the node's parameter `smoothing` (default: off)",
+        help="cut-off frequency of the smoothing over time, as the node's parameter `smoothing` (default: off)",
     )
     add_topics(parser)
     parser.add_argument(

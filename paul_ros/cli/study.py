@@ -27,9 +27,11 @@ Its subfolder work/ keeps the runs, so that the same command continues an interr
 
 examples:
   paul study bottleneck --data drink.npz yoga.npz --seeds 10 -o out/studies
-  paul study hidden --data S5_train.npz --values 0,0.3,0.6 --set codes=encoder -o out/studies
+  paul study hidden --data S5_train.npz --values 0,0.3,0.6 -o out/studies \\
+      --set codes=encoder
   paul study latent --data drink.npz pickup.npz -o out/studies
-  paul study interpolation --model person.npz --data person2d.npz --frames 10,250 -o out/studies
+  paul study interpolation --model person.npz --data person2d.npz \\
+      --frames 10,250 -o out/studies
 """
 
 

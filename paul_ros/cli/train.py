@@ -16,9 +16,12 @@ from paul_ros.stream.parameters import DEFAULTS
 _EXAMPLES = """\
 examples:
   paul train recording.mcap -o hand.npz --layout hand.yaml --set bottleneck=6
-  paul train CMU_FOLDER -o human.npz --recipe human                 views of motion capture: .asf and .amc, .bvh, .npz
-  paul train sequence.npz --recipe nrsfm --shapes shapes.npz        3D shapes of the given frames
-  paul train views.npz -o model.npz --set restarts=4                the run of the lowest final loss is kept
+  paul train CMU_FOLDER -o human.npz --recipe human
+                         views of motion capture: .asf and .amc, .bvh, .npz
+  paul train sequence.npz --recipe nrsfm --shapes shapes.npz
+                         3D shapes of the given frames
+  paul train views.npz -o model.npz --set restarts=4
+                         the run of the lowest final loss is kept
   torchrun --nproc-per-node 4 --no-python paul train views.npz -o model.npz
 
 The run is kept in MODEL.run (or SHAPES.run): checkpoint.pt, log.csv and, if the recipe searches for a start, start.npz.

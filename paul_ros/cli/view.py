@@ -18,9 +18,11 @@ with --start and --seconds. The film of a model shows its mean shape, then shape
 their first modes.
 
 examples:
-  paul view bags/one_person.mcap                              writes one_person.gif
+  paul view bags/one_person.mcap
+                         writes one_person.gif
   paul view lifted.mcap --start 60 --seconds 15 -o walk.mp4
-  paul view hand.npz -o hand.png                              a few pictures below each other
+  paul view hand.npz -o hand.png
+                         a few pictures below each other
 """
 
 

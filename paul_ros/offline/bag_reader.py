@@ -116,10 +116,19 @@ def _read_file(file: Path, wanted: frozenset[str] | None) -> Iterator[Record]:
         raise BagError(f"{file}: {error.strerror}", count) from error
     except Exception as error:  # damaged bytes surface as struct, zstd, lz4, Unicode, CRC and many other errors
         raise BagError(
-            f"{file}: damaged after {count} whole messages ({error or type(error).__name__}); those "
+            f"{file}: damaged after {count} whole messages ({_cause(error)}); those "
             f"were read. Record it again, or try `mcap recover {file.name}`",
             count,
         ) from error
+
+
+def _cause(error: Exception) -> str:
+    """Return in words why a file cannot be read further."""
+    from mcap.exceptions import RecordLengthLimitExceeded
+
+    if isinstance(error, RecordLengthLimitExceeded):
+        return "the file ends too early, or the length of a record is damaged"
+    return str(error) or type(error).__name__
 
 
 class _WholeReads(io.BufferedReader):
@@ -166,7 +175,11 @@ def _messages(stream: io.BufferedReader, size: int) -> Iterator[tuple[Any, Any, 
         elif isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, Message):
-            channel = channels[record.channel_id]
+            channel = channels.get(record.channel_id)
+            if channel is None:
+                raise ValueError(f"a message is of channel {record.channel_id}, which the file does not describe")
+            if channel.schema_id not in schemas:
+                raise ValueError(f"{channel.topic} has no schema")
             yield record, channel, schemas[channel.schema_id]
         elif isinstance(record, DataEnd):
             summary_start = stream.tell()

@@ -67,7 +67,7 @@ def _read(path: Path) -> dict[Any, Any]:
         data = yaml.safe_load(path.read_bytes())
     except OSError as error:
         raise ParameterError(f"camera file {path}: {error.strerror or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date such as 2020-99-99 is a ValueError
         raise ParameterError(f"camera file {path} is neither YAML nor JSON: {_CURE}") from error
     if not isinstance(data, dict):
         raise ParameterError(f"camera file {path} has no keys: {_CURE}")
@@ -90,7 +90,7 @@ def _numbers(path: str | Path, data: dict[str, Any], keys: tuple[str, str]) -> l
     rows: Any = value.get("data") if isinstance(value, dict) else value
     try:
         flat = [float(number) for row in rows for number in (row if isinstance(row, list) else [row])]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ParameterError(f"camera file {path}: {key} is not a list of numbers: {_CURE}") from None
     if not all(map(math.isfinite, flat)):
         raise ParameterError(f"camera file {path}: {key} has a number that is not finite: {_CURE}")

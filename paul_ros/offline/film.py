@@ -70,7 +70,8 @@ def view_bag(
     excerpt = Excerpt.choose(bag, topics, start, seconds)
     if excerpt is None:
         replay(bag, stream, topics=topics)  # explains a bag that has no keypoints at all
-        raise BagError(f"{bag}: no keypoints from {start:g} s on for so long; `paul inspect` shows how long it is")
+        when = f"after {start:g} s" if seconds is None else f"from {start:g} s to {start + seconds:g} s"
+        raise BagError(f"{bag}: no keypoints {when}; `paul inspect` shows how long the bag is")
     with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / "part.mcap"
         excerpt.copy(bag, part, topics)

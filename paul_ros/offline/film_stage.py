@@ -59,7 +59,8 @@ class Stage:
         centres = _smooth([points.mean((0, 1)) if len(points) else None for points in bodies])
         around = [points - centre for points, centre in zip(bodies, centres)]
         reach = [np.linalg.norm(points, axis=2).max() * np.ones(1) if len(points) else None for points in around]
-        everywhere = np.concatenate([points.reshape(-1, 3) for points in bodies])
+        # Frames without persons may have the points of another layout: the bag's layout shows with the first person.
+        everywhere, centred = (np.concatenate([body.reshape(-1, 3) for body in which]) for which in (bodies, around))
         metric = done.stream.units == "m"
         return cls(
             done,
@@ -67,7 +68,7 @@ class Stage:
             first,
             centres,
             1.05 * _smooth(reach)[:, 0],
-            float(np.percentile(everywhere[:, 1] if metric else np.concatenate(around)[..., 1], 98)),
+            float(np.percentile(everywhere[:, 1] if metric else centred[:, 1], 98)),
             _room(everywhere) if metric else None,
             _image(done),
             Canvas(),

@@ -17,7 +17,8 @@ from paul_ros.offline.arrays import Persons
 from paul_ros.stream.layout_search import PREFERRED
 
 _MAX_FRAME = 2**63  # of an int64
-_COLUMNS = "frame,keypoint,x,y and, if there are any, person and confidence"
+_NEEDED, _OPTIONAL = ("frame", "keypoint", "x", "y"), ("person", "confidence")
+_COLUMNS = f"{','.join(_NEEDED)} and, if there are any, {' and '.join(_OPTIONAL)}"
 
 
 class _Row(NamedTuple):
@@ -57,7 +58,10 @@ def _rows(lines: Any) -> Iterator[_Row]:
     try:
         header = [name.strip().lower() for name in next(lines, [])]
         place = {name: index for index, name in enumerate(header)}
-        missing = [name for name in ("frame", "keypoint", "x", "y") if name not in place]
+        twice = sorted({name for name in (*_NEEDED, *_OPTIONAL) if header.count(name) > 1})
+        if twice:
+            raise KeypointFileError(f"has the column {twice[0]} twice: keep one of them")
+        missing = [name for name in _NEEDED if name not in place]
         if missing:
             found = ",".join(header)[:100] or "none"
             raise KeypointFileError(f"lacks {', '.join(missing)} in its columns ({found}): they must be {_COLUMNS}")

@@ -80,7 +80,7 @@ def _open_npz(file: BinaryIO, layout: Layout | None, model: Layout) -> KeypointF
     count, points = xy.shape[:2]
     layout = _checked_layout(layout, points, model)
     confidence = _array(arrays, "confidence", (count, points), "number") if confidence is None else confidence
-    visible = _array(arrays, "visible", (count, points), "bool")
+    visible = _flags(arrays, "visible", (count, points))
     frame = _array(arrays, "frame", (count,), "integer")
     person = _array(arrays, "person", (count,), "text")
     frame = np.arange(count) if frame is None else frame
@@ -125,11 +125,21 @@ def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...], kin
     if arrays[name].shape != shape:
         raise KeypointFileError(f"{name} is {arrays[name].shape}; it must be {shape}")
     _check_kind(name, arrays[name], kind)
-    return arrays[name].astype({"bool": bool, "text": str}.get(kind, arrays[name].dtype))
+    return arrays[name].astype(str) if kind == "text" else arrays[name]
+
+
+def _flags(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return an array of flags, (shape) bool; numbers must be 0 or 1, so that no confidence passes for a flag."""
+    flags = _array(arrays, name, shape, "number")
+    if flags is None or flags.dtype == bool:
+        return flags
+    if not np.isin(flags, (0, 1)).all():
+        raise KeypointFileError(f"{name} has values other than 0 and 1; save confidences as confidence")
+    return flags.astype(bool)
 
 
 def _check_kind(name: str, array: np.ndarray, kind: str) -> None:
-    codes = {"number": "biuf", "bool": "biuf", "integer": "iu", "text": "iuU"}[kind]
+    codes = {"number": "biuf", "integer": "iu", "text": "iuU"}[kind]
     if array.dtype.kind not in codes:
         raise KeypointFileError(f"{name} has type {array.dtype}; it must be {kind}")
 

@@ -75,7 +75,8 @@ class LiftedFile:
                 tail = [person["ambiguity"], str(person["certified"]).lower(), sigma, person["reason"], self.units]
                 for name, point in zip(self.layout.names, points):
                     writer.writerow([person["frame"], person["person"], name, *point, *root, *tail])
-            file.write(text.getvalue().encode())
+            # JSON allows half a surrogate pair in an id; UTF-8 does not.
+            file.write(text.getvalue().encode(errors="backslashreplace"))
             text.seek(0)
             text.truncate()
 

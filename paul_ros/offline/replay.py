@@ -173,7 +173,6 @@ class _OfflineNode:
         self.keypoint_messages = 0
         self._make = BagMessages()
         self._builder = MessageBuilder(self._make)
-        self._builder = MessageBuilder(self._make)
         self._described: dict = {}
         self._flat_truth: dict[int, np.ndarray] = {}  # stamp -> (N*P,3) in the input's layout
         self._last_time = 0
