@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
@@ -14,7 +13,6 @@ from training.distributed import from_first
 from training.errors import DataError, MocapError
 from training.loading import load_training_data
 from training.options import TrainingOptions
-from training.people.clips import motion_files
 from training.people.human_data import check_outside, make_file, views_of
 from training.people.human_points import human_layout
 from training.preflight import check_recipe
@@ -22,20 +20,6 @@ from training.recipe import Recipe
 
 VIEWS_FILE = "views.npz"
 """File of the views in the run's folder."""
-
-
-def is_motion_capture(folder: Path) -> bool:
-    """Return whether the folder holds files of motion capture."""
-    return bool(motion_files(folder))
-
-
-def check_motion_capture(options: TrainingOptions) -> None:
-    """Check that no output lies in the folder that is read.
-
-    Raises:
-        MocapError: the next run would take an output for motion capture.
-    """
-    check_outside(options.data[0], options.outputs)
 
 
 def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
@@ -54,8 +38,9 @@ def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.
     Raises:
         RecipeError: the recipe has no views, or does not fit the layout.
         DataError: the layout has other points than motion capture gives.
-        MocapError: the files cannot be used.
+        MocapError: the files cannot be used, or an output lies in their folder.
     """
+    check_outside(options.data[0], options.outputs)
     settings, path = views_of(recipe), options.run_folder / VIEWS_FILE
     own = human_layout()
     layout = load_layout(options.layout) if options.layout else own
