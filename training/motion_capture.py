@@ -22,6 +22,15 @@ VIEWS_FILE = "views.npz"
 """File of the views in the run's folder."""
 
 
+def check_outputs_outside(options: TrainingOptions) -> None:
+    """Check that no output lies in the folder that is read, before the run's folder is made.
+
+    Raises:
+        MocapError: the next run would take an output for motion capture.
+    """
+    check_outside(options.data[0], options.outputs)
+
+
 def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
     """Make views of a folder of motion capture, or load those that the run's folder keeps.
 
@@ -38,9 +47,8 @@ def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.
     Raises:
         RecipeError: the recipe has no views, or does not fit the layout.
         DataError: the layout has other points than motion capture gives.
-        MocapError: the files cannot be used, or an output lies in their folder.
+        MocapError: the files cannot be used.
     """
-    check_outside(options.data[0], options.outputs)
     settings, path = views_of(recipe), options.run_folder / VIEWS_FILE
     own = human_layout()
     layout = load_layout(options.layout) if options.layout else own

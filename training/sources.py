@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,33 +16,26 @@ from training.options import TrainingOptions
 from training.preflight import check_recipe
 from training.recipe import Recipe
 
+Loader = Callable[[TrainingOptions, Recipe, torch.device], tuple[TrainingData, Recipe]]
+"""Loads the data, and completes the recipe by what the kind of data needs.
 
-def load_data(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
-    """Load the data, and complete the recipe by what the kind of data needs.
+The recipe's ``views`` are then complete for motion capture and None for other data. The recipe fits the layout of the
+data (``check_recipe``) before any long work begins.
+"""
 
-    Only a folder of motion capture imports ``training.people``. The recipe fits the layout of the data
-    (``check_recipe``) before any long work begins.
 
-    Args:
-        options: of the command.
-        recipe: of the run.
-        device: of this process.
-
-    Returns:
-        The data, and the recipe whose ``views`` are complete for motion capture and None for other data.
+def loader_of(options: TrainingOptions) -> Loader:
+    """Return the loader for the kind of data. Only a folder of motion capture imports ``training.people``.
 
     Raises:
-        DataError, BagError, MocapError, RecipeError: see the loaders.
-        ModelError: see ``check_recipe``.
+        MocapError: an output lies in the folder of motion capture.
     """
-    if is_motion_capture(options.data):
-        from training.motion_capture import load_motion_capture
+    if not is_motion_capture(options.data):
+        return load_keypoints
+    from training.motion_capture import check_outputs_outside, load_motion_capture
 
-        return load_motion_capture(options, recipe, device)
-    layout = load_layout(options.layout) if options.layout else None
-    data = load_files(options.data, layout, options.topic, options.min_confidence)
-    check_recipe(options, recipe, data.layout)
-    return data, replace(recipe, views=None)
+    check_outputs_outside(options)
+    return load_motion_capture
 
 
 def is_motion_capture(paths: Sequence[Path]) -> bool:
@@ -53,3 +46,16 @@ def is_motion_capture(paths: Sequence[Path]) -> bool:
     from training.people.clips import motion_files
 
     return bool(motion_files(path))
+
+
+def load_keypoints(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
+    """Load npz files and bags in every process; see ``Loader``.
+
+    Raises:
+        DataError, BagError, LayoutError: see ``load_files``.
+        RecipeError, ModelError: see ``check_recipe``.
+    """
+    layout = load_layout(options.layout) if options.layout else None
+    data = load_files(options.data, layout, options.topic, options.min_confidence)
+    check_recipe(options, recipe, data.layout)
+    return data, replace(recipe, views=None)
