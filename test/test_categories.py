@@ -16,7 +16,7 @@ from paul_ros.layout import Layout, anonymous_layout, load_layout
 from paul_ros.lifted import TOO_FEW_POINTS
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
-from training.categories import among_categories, joint_layout, load_files
+from training.categories import joint_layout, load_files
 from training.errors import DataError
 from training.judge.evaluation import evaluate_model
 from training.judge.truth import load_sequence
@@ -186,7 +186,7 @@ def test_a_category_is_judged_by_its_own_points(garage, tmp_path):
         W = archive["W"].astype(float)
     S = np.concatenate([W, W[:, :1]], axis=1)
     np.savez(garage[0], W=W, S=S)
-    truth = among_categories(load_sequence(garage[0]), load_model(tmp_path / "m.npz").layout)
+    truth = load_sequence(garage[0]).among_categories(load_model(tmp_path / "m.npz").layout)
     assert truth.present.tolist() == truth.visible.tolist() == load_files(garage).visible[:20].tolist()
     np.testing.assert_array_equal(truth.S[:, :, :7], S)
     report, compared = evaluate_model(tmp_path / "m.npz", garage[0])

@@ -13,7 +13,7 @@ from tiny_data import sequence
 
 from paul_ros.model_file import load_model, save_model
 from training.recipe import Recipe
-from training.sources import DataKind, kind_of
+from training.sources import is_motion_capture
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / "bags" / "one_person.mcap"
@@ -26,22 +26,16 @@ def run(code: str, *words: object) -> str:
     return done.stdout
 
 
-def test_the_kind_of_data_follows_from_its_files(tmp_path):
+def test_motion_capture_is_a_folder_of_its_files_that_is_no_bag(tmp_path):
     capture, bag = tmp_path / "capture", tmp_path / "bag"
     for folder in (capture, bag, tmp_path / "empty"):
         folder.mkdir()
     (capture / "01_01.bvh").touch()
     (bag / "metadata.yaml").touch()
     (bag / "01_01.bvh").touch()
-    for paths, kind in (
-        ([tmp_path / "a.npz"], DataKind.ARRAYS),
-        ([BAG], DataKind.BAG),
-        ([bag], DataKind.BAG),
-        ([tmp_path / "empty"], DataKind.BAG),
-        ([tmp_path / "a.npz", BAG], DataKind.SEVERAL_FILES),
-        ([capture], DataKind.MOTION_CAPTURE),
-    ):
-        assert kind_of(paths) is kind, paths
+    for paths in ([tmp_path / "a.npz"], [BAG], [bag], [tmp_path / "empty"], [capture, capture]):
+        assert not is_motion_capture(paths), paths
+    assert is_motion_capture([capture])
 
 
 TRAIN = """

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from paul_ros.layout import Layout
 from training.data import DEFAULT_LAYOUT, TrainingData
 from training.errors import DataError
 from training.loading import MIN_CONFIDENCE, load_training_data
-
-if TYPE_CHECKING:
-    from training.judge import truth as judge
 
 
 def load_files(
@@ -101,22 +98,6 @@ def joint_layout(names: list[str], layouts: list[Layout]) -> Layout:
             joint[key] += items
         categories[category] = own["names"]
     return Layout.from_dict({"name": "+".join(names), **joint, "root": joint["names"], "categories": categories})
-
-
-def among_categories(truth: judge.Sequence, layout: Layout) -> judge.Sequence:
-    """Return a sequence of one category, which has the category's name, in the joint layout.
-
-    Points of other categories are hidden, and their truth is unknown. Any other sequence is returned as it is.
-    """
-    points = list(layout.categories.get(truth.name, ()))
-    if truth.W.shape[2] != len(points):
-        return truth
-    frames, every = len(truth.W), len(layout.names)
-    W, visible = np.zeros((frames, 2, every)), np.zeros((frames, every), bool)
-    S = np.full((frames, 3, every), np.nan)
-    W[:, :, points], visible[:, points], S[:, :, points] = truth.W, truth.visible, truth.S
-    edges = np.array(points)[truth.edges] if len(truth.edges) else truth.edges
-    return replace(truth, W=W, visible=visible, S=S, edges=edges)
 
 
 def _prefixed(item: Any, prefix: str) -> Any:

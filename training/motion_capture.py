@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
@@ -14,7 +13,6 @@ from training.distributed import from_first
 from training.errors import DataError, MocapError
 from training.loading import load_training_data
 from training.options import TrainingOptions
-from training.people.clips import motion_files
 from training.people.human_data import check_outside, make_file, views_of
 from training.people.human_points import human_layout
 from training.preflight import check_recipe
@@ -24,13 +22,8 @@ VIEWS_FILE = "views.npz"
 """File of the views in the run's folder."""
 
 
-def is_motion_capture(folder: Path) -> bool:
-    """Return whether the folder holds files of motion capture."""
-    return bool(motion_files(folder))
-
-
-def check_motion_capture(options: TrainingOptions) -> None:
-    """Check that no output lies in the folder that is read.
+def check_outputs_outside(options: TrainingOptions) -> None:
+    """Check that no output lies in the folder that is read, before the run's folder is made.
 
     Raises:
         MocapError: the next run would take an output for motion capture.

@@ -33,6 +33,7 @@ _NOT_NEGATIVE = (
     *("code_weight", "decay_weight", "nuclear_weight", "handedness_weight", "bone_weight"),
 )
 _LARGEST = {"seed": 2**32 - 1, "batch": 2**20, "restarts": 10_000}
+"""Largest values of settings that random generators, memory or time would otherwise limit in the middle of a run."""
 
 
 @dataclass(frozen=True)

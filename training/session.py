@@ -25,7 +25,7 @@ from training.preflight import RUN_FILES, check_options
 from training.progress import progress_bar, share_bar
 from training.recipe import Recipe
 from training.reconstruction import FinishedRun, reconstruction_of, restarts, run_folder, train_restarts
-from training.sources import check_data, load_data
+from training.sources import loader_of
 from training.tensorboard import FOLDER as BOARD_FOLDER
 from training.tensorboard import Board
 from training.trainer import Trainer
@@ -58,12 +58,12 @@ def train(options: TrainingOptions) -> Results | None:
     """
     recipe = Recipe.load(options.recipe, options.overrides)
     folders = [run_folder(options.run_folder, recipe, one.seed) for one in restarts(recipe)]
-    check_data(options)
+    load = loader_of(options)
     check_options(options, recipe, folders)
     torch.set_num_threads(options.threads)
     device = training_device(options.device)
     with joined(device):
-        data, recipe = load_data(options, recipe, device)
+        data, recipe = load(options, recipe, device)
         data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe, options)))
         if options.fresh and is_first():
             _delete_runs(folders)
@@ -99,7 +99,8 @@ def _unused(data: TrainingData, recipe: Recipe, options: TrainingOptions) -> tup
     notes = []
     if data.detected is not None and not recipe.hold:
         notes.append("its detected points are not used: h learns to read them only with held solutions (setting hold)")
-    if recipe.views is None and any(override.startswith("views.") for override in options.overrides):
+    names = [override.partition("=")[0].partition(".")[0].strip() for override in options.overrides]
+    if recipe.views is None and "views" in names:
         notes.append("settings of views are not used: they are for a folder of motion capture")
     return tuple(notes)
 

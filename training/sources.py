@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kinds of data that `paul train` takes, and the loader of each. Only this module decides by the kind of data."""
+"""The kind of data of `paul train`, decided once: a folder of motion capture, or files of 2D keypoints."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from enum import Enum
 from pathlib import Path
 
 import torch
@@ -17,77 +16,46 @@ from training.options import TrainingOptions
 from training.preflight import check_recipe
 from training.recipe import Recipe
 
+Loader = Callable[[TrainingOptions, Recipe, torch.device], tuple[TrainingData, Recipe]]
+"""Loads the data, and completes the recipe by what the kind of data needs.
 
-class DataKind(Enum):
-    """Kind of data, by the number and type of its files."""
-
-    ARRAYS = "npz arrays"
-    BAG = "a bag of 2D keypoints"
-    SEVERAL_FILES = "recordings of one layout, or categories of objects"
-    MOTION_CAPTURE = "a folder of motion capture"
+The recipe's ``views`` are then complete for motion capture and None for other data. The recipe fits the layout of the
+data (``check_recipe``) before any long work begins.
+"""
 
 
-def kind_of(paths: Sequence[Path]) -> DataKind:
-    """Return the kind of data at the paths."""
-    if len(paths) > 1:
-        return DataKind.SEVERAL_FILES
-    (path,) = paths
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        from training.motion_capture import is_motion_capture
-
-        if is_motion_capture(path):
-            return DataKind.MOTION_CAPTURE
-    return DataKind.ARRAYS if path.suffix == ".npz" else DataKind.BAG
-
-
-def check_data(options: TrainingOptions) -> None:
-    """Check before anything is read that no output harms the data.
+def loader_of(options: TrainingOptions) -> Loader:
+    """Return the loader for the kind of data. Only a folder of motion capture imports ``training.people``.
 
     Raises:
-        MocapError: an output would be taken for motion capture.
+        MocapError: an output lies in the folder of motion capture.
     """
-    if kind_of(options.data) is DataKind.MOTION_CAPTURE:
-        from training.motion_capture import check_motion_capture
+    if not is_motion_capture(options.data):
+        return load_keypoints
+    from training.motion_capture import check_outputs_outside, load_motion_capture
 
-        check_motion_capture(options)
+    check_outputs_outside(options)
+    return load_motion_capture
 
 
-def load_data(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
-    """Load the data, and complete the recipe by what the kind of data needs.
+def is_motion_capture(paths: Sequence[Path]) -> bool:
+    """Return whether the data is one folder that holds files of motion capture and is no bag."""
+    path = Path(paths[0])
+    if len(paths) > 1 or not path.is_dir() or (path / "metadata.yaml").exists():
+        return False
+    from training.people.clips import motion_files
 
-    The recipe fits the layout of the data (``check_recipe``) before any long work begins.
+    return bool(motion_files(path))
 
-    Args:
-        options: of the command.
-        recipe: of the run.
-        device: of this process.
 
-    Returns:
-        The data, and the recipe whose ``views`` are complete for motion capture and None for other data.
+def load_keypoints(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
+    """Load npz files and bags in every process; see ``Loader``.
 
     Raises:
-        DataError, BagError, MocapError, RecipeError: see the loaders.
+        DataError, BagError, LayoutError: see ``load_files``.
+        RecipeError, ModelError: see ``check_recipe``.
     """
-    return LOADERS[kind_of(options.data)](options, recipe, device)
-
-
-def _load_files(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
     layout = load_layout(options.layout) if options.layout else None
     data = load_files(options.data, layout, options.topic, options.min_confidence)
     check_recipe(options, recipe, data.layout)
     return data, replace(recipe, views=None)
-
-
-def _load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
-    from training.motion_capture import load_motion_capture
-
-    return load_motion_capture(options, recipe, device)
-
-
-LOADERS: dict[DataKind, Callable[[TrainingOptions, Recipe, torch.device], tuple[TrainingData, Recipe]]] = {
-    DataKind.ARRAYS: _load_files,
-    DataKind.BAG: _load_files,
-    DataKind.SEVERAL_FILES: _load_files,
-    DataKind.MOTION_CAPTURE: _load_motion_capture,
-}
-"""Loader by the kind of data. Only the last one imports ``training.people``."""

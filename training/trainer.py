@@ -204,7 +204,7 @@ class Trainer:
         return (self.step, round(self.seconds, 2), *losses, round(rate, 8), phase)
 
     def _renew_solutions(self) -> None:
-        """Make the networks' own solutions the lesson; at the begin of a generation fresh networks learn it."""
+        """Make the networks' own solutions the lesson; at the beginning of a generation fresh networks learn it."""
         self._teacher = {name: weights.clone() for name, weights in self.networks.state_dict().items()}
         self._lesson = self._solutions()
         if self.schedule.begins_generation(self.step):

@@ -19,24 +19,23 @@ from paul_ros.lifted import AMBIGUOUS, TOO_FEW_POINTS
 from paul_ros.model import Model
 from paul_ros.model_file import load_model
 from paul_ros.versions import versions
-from training.categories import among_categories
 from training.errors import DataError
 from training.judge.comparison import Comparison, errors
-from training.judge.prediction import Prediction, Progress, centred, predict, predict_rigid, rigid_mean
+from training.judge.prediction import CountFrames, Prediction, centred, predict, predict_rigid, rigid_mean
 from training.judge.truth import Sequence, load_sequence
 
 _TIMED_FRAMES = 100
 
 
 def evaluate_model(
-    model_name: str | Path, data: str | Path, progress: Progress = lambda count: None
+    model_name: str | Path, data: str | Path, count: CountFrames = lambda number: None
 ) -> tuple[dict[str, Any], Comparison]:
     """Lift every frame of a file and judge it.
 
     Args:
         model_name: file or shipped model.
         data: npz with W and the truth S.
-        progress: called with numbers of frames.
+        count: called with numbers of frames.
 
     Returns:
         The report, with the keys of `paul replay --json`, and the compared frames.
@@ -46,13 +45,13 @@ def evaluate_model(
         ModelError: the model cannot be used.
     """
     model = _load_model(model_name)
-    truth = among_categories(load_sequence(data), model.layout)
+    truth = load_sequence(data).among_categories(model.layout)
     if len(model.layout.names) != truth.W.shape[2]:
         raise DataError(
             f"'{data}' has {truth.W.shape[2]} points, model '{model_name}' has {len(model.layout.names)}: "
             "evaluate it with data of its own layout"
         )
-    found = predict(model, truth.W, truth.visible, progress)
+    found = predict(model, truth.W, truth.visible, count)
     rigid = predict(model.rigid(), truth.W, truth.visible)
     compared = Comparison.of(truth, found, rigid, flip=not model.header["chirality"]["known"])
     about = {"model": model.name, "model_sha256": model.sha256, "layout": model.layout.name}

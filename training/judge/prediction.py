@@ -15,13 +15,13 @@ from paul_ros.model import Model
 from paul_ros.orthographic_n_point import onp
 
 MIN_POINTS = 4
-"""Visible points that a frame must have to be judged: three points fit nearly any shape."""
+"""Visible points that a frame must have to be judged: nearly any shape fits three points."""
 
 _BLOCK = 256  # frames at a time
 _MEAN_ROUNDS = 10
 _MEAN_FRAMES = 1000
 
-Progress = Callable[[int], object]
+CountFrames = Callable[[int], object]
 """Function that is called with the number of frames done since its last call."""
 
 
@@ -42,7 +42,7 @@ class Prediction:
     ambiguity: np.ndarray | None = None
 
 
-def predict(model: Model, W: np.ndarray, visible: np.ndarray, progress: Progress = lambda count: None) -> Prediction:
+def predict(model: Model, W: np.ndarray, visible: np.ndarray, count: CountFrames = lambda number: None) -> Prediction:
     """Predict every frame alone: encoder, decoder, orthographic-N-point (the paper's section 4.2).
 
     The result has the observed scale.  A model of unit scale knows it.  Otherwise it is the camera's scale, so shapes
@@ -53,7 +53,7 @@ def predict(model: Model, W: np.ndarray, visible: np.ndarray, progress: Progress
         model: that predicts.
         W: (F,2,P) image points in any unit; in the training's unit for a model of unit scale.
         visible: (F,P) bool.
-        progress: called after each block of frames.
+        count: called after each block of frames.
     """
     unit = model.header["image_unit"] if model.scale == "unit" else 1.0
     scale: Literal["free", "unit"] = "unit" if model.scale == "unit" else "free"
@@ -65,7 +65,7 @@ def predict(model: Model, W: np.ndarray, visible: np.ndarray, progress: Progress
         S[rows] = unit * pose.scale[:, None, None] * centred(pose.R @ shapes, visible[rows])
         dropped[rows] = np.where(pose.determined, "", DEGENERATE_POINTS)
         certified[rows], ambiguity[rows] = pose.certified, pose.ambiguity
-        progress(len(shapes))
+        count(len(shapes))
     dropped[visible.sum(1) < MIN_POINTS] = TOO_FEW_POINTS
     return Prediction(S, dropped, certified, ambiguity)
 

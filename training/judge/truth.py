@@ -10,6 +10,7 @@ import numpy as np
 
 from paul_ros.errors import NpzError
 from paul_ros.files import read_npz
+from paul_ros.layout import Layout
 from training.errors import DataError
 
 
@@ -65,6 +66,21 @@ class Sequence:
             raise DataError(f"'{self.name}' cannot be seen by other cameras: the truth S of some points is unknown")
         S = random_rotations(len(self.S), seed) @ (self.S - self.S.mean(2, keepdims=True))
         return replace(self, W=np.where(self.visible[:, None], S[:, :2], 0.0), S=S)
+
+    def among_categories(self, layout: Layout) -> Sequence:
+        """Return a sequence of one category, which has the category's name, in the joint layout.
+
+        Points of other categories are hidden, and their truth is unknown. Any other sequence is returned as it is.
+        """
+        points = list(layout.categories.get(self.name, ()))
+        if self.W.shape[2] != len(points):
+            return self
+        frames, every = len(self.W), len(layout.names)
+        W, visible = np.zeros((frames, 2, every)), np.zeros((frames, every), bool)
+        S = np.full((frames, 3, every), np.nan)
+        W[:, :, points], visible[:, points], S[:, :, points] = self.W, self.visible, self.S
+        edges = np.array(points)[self.edges] if len(self.edges) else self.edges
+        return replace(self, W=W, visible=visible, S=S, edges=edges)
 
 
 def random_rotations(count: int, seed: int) -> np.ndarray:

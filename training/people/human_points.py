@@ -26,8 +26,8 @@ from paul_ros.layout import Layout, Mapping, load_layout
 from training.people.mocap import CMU31, joint
 
 # All heads are equal: averages of adults, metres in the head frame (lateral to the left, up, forward) from the ear
-# level.  Face: Farkas, Anthropometry of the Head and Face, 1994.  The eyes' inner corners are 0.033 apart, the outer
-# ones 0.09; the mouth is 0.05 wide.  head_top: tragion to top of head 0.13, ANSUR II 2012.
+# level.  Eyes and mouth: Farkas, Anthropometry of the Head and Face, 1994.  The eyes' inner corners are 0.033
+# apart, the outer ones 0.09; the mouth is 0.05 wide.  head_top: tragion to top of head 0.13, ANSUR II 2012.
 _EAR_LEVEL = 0.6  # share of the way from upperneck to head
 _HEAD = {
     "nose": (0.0, -0.02, 0.11),

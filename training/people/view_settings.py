@@ -40,7 +40,7 @@ class ViewSettings:
     # Cameras
     field: tuple[float, float] = (50.0, 110.0)  # horizontal field of view
     off_axis: float = 0.4  # standard deviation of the body's place in the image, in half widths and half heights
-    roll: float = 2.0  # standard deviation of the roll of level cameras
+    roll: float = 2.0  # standard deviation of the roll of most cameras
     tilted: float = 0.1  # share of tilted cameras ...
     tilt: float = 15.0  # ... and the standard deviation of their roll
     border: bool = True  # whether points outside of the image are hidden
@@ -60,7 +60,7 @@ class ViewSettings:
         ("mediapipe33", 0.15),
         (COMPLETE, 0.15),
     )
-    seed: int = 0  # of all random numbers
+    seed: int = 0  # of all random numbers of the views
 
     def __post_init__(self) -> None:
         for name in _RANGES:

@@ -16,7 +16,7 @@ from paul_ros import viewing_sphere
 from training.start.observations import Observations
 
 RIDGE = 1e-9
-"""Added to the diagonal of matrices that may be singular, relative to their size."""
+"""Added to the diagonal of matrices that may be singular."""
 
 
 @dataclass(frozen=True)

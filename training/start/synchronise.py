@@ -26,7 +26,7 @@ _AGREEING = 0.995
 a third of the frames is mirrored."""
 
 _FLAT = 1e-4
-_TINY = 1e-100  # whose cube is no zero yet
+_TINY = 1e-100  # smallest divisor; its cube is not yet rounded to zero
 _ROUNDS = 4
 _STAGES = ((5, 24), (6, 24), (6, 48), (8, 48))
 """Principal directions and clusters of each stage of a round. Few directions help far from the solution; many have room
@@ -177,7 +177,7 @@ def flipped(X: Tensor, directions: int, clusters: int, generator: np.random.Gene
 
     Args:
         X: (F,3,P) shapes, camera frame.
-        directions: principal directions that hold no energy.
+        directions: number of principal directions whose content is no energy.
         clusters: largest number of clusters.
         generator: of the order in which clusters are tried.
 

@@ -15,7 +15,6 @@ from paul_ros.model_file import load_model
 from paul_ros.normalisation import normalise
 from paul_ros.orthographic_n_point import onp
 from paul_ros.versions import versions
-from training.categories import among_categories
 from training.errors import DataError
 from training.judge.pictures import blue_to_red, draw_shape, frame_panels, new_figure, save_figure, turned_view
 from training.judge.truth import Sequence
@@ -63,7 +62,7 @@ def _load_views(file: Path, model: Model) -> Sequence:
         )
     unknown = np.full((len(data.W), 3, data.W.shape[2]), np.nan)
     views = Sequence(Path(file).stem, data.W, data.visible, unknown, np.zeros((0, 2), int), metres=False)
-    return among_categories(views, model.layout)
+    return views.among_categories(model.layout)
 
 
 def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> dict[str, Any]:
