@@ -16,13 +16,17 @@ from paul_ros.stream.parameters import DEFAULTS
 _EXAMPLES = """\
 examples:
   paul train recording.mcap -o hand.npz --layout hand.yaml --set bottleneck=6
-  paul train CMU_FOLDER -o human.npz --recipe human                 views of motion capture: .asf and .amc, .bvh, .npz
-  paul train sequence.npz --recipe nrsfm --shapes shapes.npz        3D shapes of the given frames
-  paul train views.npz -o model.npz --set restarts=4                the run of the lowest final loss is kept
+  paul train CMU_FOLDER -o human.npz --recipe human
+  paul train sequence.npz --recipe nrsfm --shapes shapes.npz
+  paul train views.npz -o model.npz --set restarts=4
   torchrun --nproc-per-node 4 --no-python paul train views.npz -o model.npz
 
-The run is kept in MODEL.run (or SHAPES.run): checkpoint.pt, log.csv and, if the recipe searches for a start, start.npz.
-The same command continues a stopped run, to the bit. Several processes train as one does, up to rounding.
+CMU_FOLDER holds motion capture: .asf and .amc, .bvh, .npz. With `restarts`, the run of
+the lowest final loss is kept.
+
+The run is kept in MODEL.run (or SHAPES.run): checkpoint.pt, log.csv and, if the recipe
+searches for a start, start.npz. The same command continues a stopped run, to the bit.
+Several processes train as one does, up to rounding.
 """
 
 
@@ -86,7 +90,7 @@ def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         help="npz with W (F,2,P) and optional visible (F,P); a bag of 2D keypoints; or a folder of motion capture of "
-        "people. Several files are recordings of one layout, or else categories of objects, one a file",
+        "people. Several files are recordings of one layout, or else categories of objects, one per file",
     )
     parser.add_argument(
         "--layout",
