@@ -23,10 +23,10 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
 
-smartquotes_action = "qe"  # quotes and ellipses; options such as --json keep their dashes
 html_theme = "furo"
 html_title = "paul_ros"
 html_static_path = [str(Path(__file__).resolve().parent / "style")]

@@ -29,6 +29,7 @@ PAGES = (ROOT / "README.md", ROOT / "benchmarks/RESULTS.md", *sorted((ROOT / "do
 _FIGURE = re.compile(r"(-?\d[\d,]*)(\.\d+)?(\*\*)?<!--([\w.]+)-->")
 _REGION = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n        .*)*)", re.MULTILINE)
+_BARE_OPTION = re.compile(r"`[^`]*`|(--\w[\w-]*)")
 _PAGE = re.compile(r"docs/(\w+/\w+\.md)")
 _COMMENT = re.compile(r"^    (\w+): .*?  # (.*)$", re.MULTILINE)
 _SECTION = re.compile(r"\nAttributes:\n(.*?)(?:\n\n|\Z)", re.DOTALL)
@@ -101,7 +102,10 @@ def layouts() -> str:
 
 
 def recipes() -> str:
-    """Return a table of the shipped recipes: the comment at the head of each file, and what it sets; lists by their first item."""
+    """Return a table of the shipped recipes: the comment at the head of each file, and what it sets.
+
+    A list shows its first item.
+    """
     folder = ROOT / "training/recipes"
     rows = []
     for path in sorted(folder.glob("*.yaml")):
@@ -204,8 +208,9 @@ def _placeholder(action: argparse.Action) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return text of a parser as a cell or line of Markdown."""
-    return re.sub(r"(\*|<)", r"\\\1", " ".join(text.split()))
+    """Return text of a parser as a cell or line of Markdown; HTML would draw the dashes of a bare option as one."""
+    text = re.sub(r"(\*|<)", r"\\\1", " ".join(text.split()))
+    return _BARE_OPTION.sub(lambda match: f"`{match[1]}`" if match[1] else match[0], text)
 
 
 def table(head: tuple[str, ...], rows: list[tuple]) -> str:

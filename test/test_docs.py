@@ -247,6 +247,11 @@ def test_the_keys_of_a_replay_are_those_documented(tmp_path: Path) -> None:
     assert json.loads(report.read_text()).keys() == first_column("docs/reference/json.md", "## `paul replay`")
 
 
+def test_bare_options_of_a_help_text_become_code() -> None:
+    text = "with --truth, of `paul train --shapes`; * is any"
+    assert script("generate")._escaped(text) == r"with `--truth`, of `paul train --shapes`; \* is any"
+
+
 def test_the_keys_of_a_layout_file_are_those_documented() -> None:
     with pytest.raises(LayoutError, match="unknown key 'colour'") as refused:
         Layout.from_dict({"colour": "red"})
