@@ -53,7 +53,7 @@ class Lifted:
             distance errors of persons in the shipped bags.
         used: (N,P) bool, the points that the person was lifted from: the visible ones without misdetections. Those
             are points beyond 60 degrees from the person's direction, or far from the lifted shape.
-        reason: N slugs, '' if lifted, else why not:
+        reason: N short names, '' if lifted, else why not:
             ``too_few_points``: fewer visible points than the model needs.
             ``degenerate_points``: the points fix no pose. They lie on one line or in two places or, with intrinsics,
             have an rms extent below 1 pixel.
