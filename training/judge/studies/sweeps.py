@@ -9,10 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from paul_ros.offline.tables import cell, render
 from training.judge.experiments import Experiment, Outcome, chosen, groups, outcome_row, summary
+from training.judge.nrsfm import bad_runs
 from training.judge.pictures import COLOURS, legend_above, new_figure, percent_axis, titled
 from training.judge.studies.study import Study
 from training.judge.truth import Sequence
+
+_FIGURES = ("mean", "deviation", "median", "best", "worst")
 
 
 @dataclass(frozen=True)
@@ -80,31 +84,20 @@ class Sweep:
 
     def table(self, report: dict[str, Any]) -> str:
         """Format a line for each sequence and value."""
-        head = (
-            f"{'sequence':<12}{self.axis:>24}{'mean':>9}{'deviation':>11}{'median':>9}{'best':>8}{'worst':>8}{'bad':>7}"
-            f"{'one flip':>10}{'ratio':>7}{'seconds':>9}"
-        )
-        lines, last = [head], None
+        columns = ("sequence", self.axis, *_FIGURES, "bad", "one flip", "ratio", "seconds")
+        rows, last = [], None
         for row in report["summary"]:
             name = row["sequence"] if row["sequence"] != last else ""
             last = row["sequence"]
-            mean, deviation, median, best, worst = (
-                row[f"{key}_ne_flip_frame_percent"] for key in ("mean", "deviation", "median", "best", "worst")
-            )
-            bad = f"{round(row['bad_basin_share'] * row['runs'])}/{row['runs']}"
-            ratio = "-" if row["ratio"] is None else f"{row['ratio']:.2f}"
-            lines.append(
-                f"{name:<12}{self.format(row['value']):>24}{mean:>9.2f}{deviation:>11.2f}{median:>9.2f}{best:>8.2f}"
-                f"{worst:>8.2f}{bad:>7}{row['median_ne_flip_global_percent']:>10.2f}{ratio:>7}"
-                f"{row['seconds_median']:>9.0f}"
-            )
-        return "\n".join(
-            [
-                f"normalised error in % over {report['summary'][0]['runs']} seeds, depth flip per frame",
-                *lines,
-                "one flip: the median with one flip for all frames; bad: runs above three times that; "
-                f"ratio: that median over that of {self.reference}",
-            ]
+            figures = (cell(row[f"{key}_ne_flip_frame_percent"], 2) for key in _FIGURES)
+            one_flip = cell(row["median_ne_flip_global_percent"], 2)
+            more = (bad_runs(row), one_flip, cell(row["ratio"], 2), cell(row["seconds_median"], 0))
+            rows.append((name, self.format(row["value"]), *figures, *more))
+        return (
+            f"normalised error in % over {report['summary'][0]['runs']} seeds, depth flip per frame\n"
+            + render(columns, "t" + 10 * "n", rows)
+            + "\none flip: the median with one flip for all frames; bad: runs above three times that; "
+            f"ratio: that median over that of {self.reference}"
         )
 
     def draw(self, outcomes: list[Outcome], report: dict[str, Any]) -> Any:
