@@ -4,17 +4,18 @@
 from __future__ import annotations
 
 import re
+import sys
 
 import pytest
 
 from paul_ros.errors import MissingPackageError
 from paul_ros.offline.tables import cell, render
 
-COLUMNS = "", "lifted", "99 %", ""
+COLUMNS = ("", "text"), ("lifted", ".1f"), ("99 %", ".2f"), ("", "unit")
 ROWS = [
-    ("error [bold] of :smile:", "60.3", "9.20 / 11.00", "mm"),
+    ("error [bold] of :smile:", 60.3, "9.20 / 11.00", "mm"),
     (),
-    ("誤差", "12345.6", "-", "µs of one pose, alone or in a batch of many"),
+    ("誤差", 12345.6, None, "µs of one pose, alone or in a batch of many"),
 ]
 
 
@@ -26,7 +27,7 @@ def terminal(monkeypatch):
         monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
         monkeypatch.setenv("COLUMNS", str(width))
         monkeypatch.setenv("TERM", "xterm")
-        return render(COLUMNS, "tnnu", ROWS).splitlines()
+        return render(COLUMNS, ROWS).splitlines()
 
     return drawn
 
@@ -38,7 +39,7 @@ def plain(line: str) -> str:
 @pytest.mark.parametrize("variable", ["COLUMNS", "FORCE_COLOR"])
 def test_a_pipe_gets_plain_text(variable, monkeypatch):
     monkeypatch.setenv(variable, "20")
-    assert render(COLUMNS, "tnnu", ROWS).splitlines() == [
+    assert render(COLUMNS, ROWS).splitlines() == [
         "                           lifted          99 %",
         " error [bold] of :smile:     60.3  9.20 / 11.00  mm",
         "",
@@ -47,7 +48,7 @@ def test_a_pipe_gets_plain_text(variable, monkeypatch):
 
 
 def test_nothing_is_folded_in_a_pipe():
-    (line,) = render(("", ""), "tu", [("long " * 100, "unit " * 100)]).splitlines()
+    (line,) = render((("", "text"), ("", "unit")), [("long " * 100, "unit " * 100)]).splitlines()
     assert line.split() == 100 * ["long"] + 100 * ["unit"]
 
 
@@ -61,7 +62,7 @@ def test_a_terminal_gets_styles_and_a_rule(terminal):
 def test_a_narrow_terminal_folds_texts_between_words_and_no_numbers(terminal, width):
     lines = [plain(line) for line in terminal(width)]
     text = "\n".join(lines)
-    words = [word for row in ROWS for cell in row for word in cell.split()]
+    words = [word for row in ROWS for value in row for word in cell(value).split()]
     assert all(word in text for word in (*words, "lifted", "99 %", "9.20 / 11.00"))
     assert len(lines) > 5 and max(map(len, lines)) <= max(width, 50)
 
@@ -69,23 +70,23 @@ def test_a_narrow_terminal_folds_texts_between_words_and_no_numbers(terminal, wi
 def test_a_dumb_terminal_gets_no_styles(terminal, monkeypatch):
     terminal(100)
     monkeypatch.setenv("TERM", "dumb")
-    assert "\x1b" not in render(COLUMNS, "tnnu", ROWS)
+    assert "\x1b" not in render(COLUMNS, ROWS)
 
 
 def test_a_closed_standard_output_is_no_terminal(monkeypatch):
     monkeypatch.setattr("sys.stdout", None)
-    assert render(("a", "b"), "tn", [("x", "1")]) == " a  b\n x  1"
+    assert render((("a", "text"), ("b", "d")), [("x", 1)]) == " a  b\n x  1"
 
 
 def test_no_headings_no_head():
-    assert render(("", ""), "tn", [("a", "1"), ("bc", "10")]) == " a    1\n bc  10"
+    assert render((("", "text"), ("", "d")), [("a", 1), ("bc", 10)]) == " a    1\n bc  10"
 
 
 def test_a_cell():
-    assert [cell(None), cell(1.25, 2), cell(3, 0)] == ["-", "1.25", "3"]
+    assert [cell(None), cell(1.25, ".2f"), cell(3, "d"), cell("a", ".1f")] == ["-", "1.25", "3", "a"]
 
 
 def test_without_rich_the_error_names_the_cure(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "rich", None)
+    monkeypatch.setitem(sys.modules, "rich", None)
     with pytest.raises(MissingPackageError, match="paul_ros\\[bags\\]"):
-        render(("a",), "t", [])
+        render([("a", "text")], [])

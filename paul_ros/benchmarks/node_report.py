@@ -9,14 +9,25 @@ from typing import Any
 import numpy as np
 
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import render
 
 _COLOURS = {"lifter": "#1f77d0", "echo": "#8a8a8a"}
 _MIN_US = 100  # where the axes of the picture begin
 _COLUMNS = (
-    *("persons", "Hz", "node", "sent", "received", "median", "99 %", "CPU", "MB"),
-    *("x echo", "99 %", "+ CPU"),
+    ("persons", "d", "persons"),
+    ("Hz", "g", "rate_hz"),
+    ("node", "text", "node"),
+    ("sent", "d", "sent"),
+    ("received", "d", "received"),
+    ("median", ".0f", "latency_median_us"),
+    ("99 %", ".0f", "latency_p99_us"),
+    ("CPU", ".0f", "cpu_us_per_frame"),
+    ("MB", ".1f", "rss_mb"),
+    ("x echo", ".2f", "latency_median_ratio"),
+    ("99 %", ".2f", "latency_p99_ratio"),
+    ("+ CPU", ".0f", "cpu_added_us_per_frame"),
 )
+"""Heading, kind and key."""
 
 
 def table(report: dict) -> str:
@@ -25,11 +36,12 @@ def table(report: dict) -> str:
     rows = []
     for row in report["rows"]:
         ratio = ratios.get((row["persons"], row["rate_hz"])) if row["node"] == "lifter" else None
-        rows.append(_cells(row) + (_ratio_cells(ratio) if ratio else ()))
+        shown = {**row, **(ratio or {})}
+        rows.append([shown[key] for *_, key in _COLUMNS if key in shown])
     starts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["start_to_first_output_s"].items())
     machine = report["machine"]
     lines = [
-        render(_COLUMNS, "nnt" + 9 * "n", rows),
+        render([column[:2] for column in _COLUMNS], rows),
         "",
         f"  start to first output: {starts}",
         f"  {machine['processor']}, {machine['cpus']} processors, load {machine['load_before']:.1f} before and "
@@ -38,35 +50,13 @@ def table(report: dict) -> str:
     return "\n".join(lines + (_soak_lines(report["soak"]) if "soak" in report else []))
 
 
-def _cells(row: dict) -> tuple[str, ...]:
-    return (
-        f"{row['persons']}",
-        f"{row['rate_hz']:g}",
-        row["node"],
-        f"{row['sent']}",
-        f"{row['received']}",
-        cell(row["latency_median_us"], 0),
-        cell(row["latency_p99_us"], 0),
-        cell(row["cpu_us_per_frame"], 0),
-        cell(row["rss_mb"]),
-    )
-
-
-def _ratio_cells(ratio: dict) -> tuple[str, ...]:
-    return (
-        cell(ratio["latency_median_ratio"], 2),
-        cell(ratio["latency_p99_ratio"], 2),
-        cell(ratio["cpu_added_us_per_frame"], 0),
-    )
-
-
 def _soak_lines(soak: dict) -> list[str]:
     """Return the memory at about twenty times, and its growth."""
     every = max(1, len(soak["memory"]) // 20)
     growth = soak["growth_mb_per_hour"]
     verdict = "too short to tell" if growth is None else f"{growth:+.2f} MB an hour in the second half"
-    rows = [(cell(at["s"] / 60), cell(at["rss_mb"], 2)) for at in soak["memory"][::every]]
-    return ["", render(("minutes", "MB"), "nn", rows), f"  at most {soak['rss_mb_max']:.2f} MB, {verdict}"]
+    rows = [(at["s"] / 60, at["rss_mb"]) for at in soak["memory"][::every]]
+    return ["", render((("minutes", ".1f"), ("MB", ".2f")), rows), f"  at most {soak['rss_mb_max']:.2f} MB, {verdict}"]
 
 
 # --- the picture

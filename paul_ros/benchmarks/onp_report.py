@@ -9,14 +9,27 @@ from typing import Any
 import numpy as np
 
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import Row, render
 
 _COLOURS = {"ours": "#111111", "lsq_svd": "#e4572e", "polar": "#f0a030", "majorise": "#1f77d0", "lm_search": "#2a9d50"}
 _MIN_ANGLE = 1e-3  # degrees; smaller angles are drawn here
 _COLUMNS = (
-    *("method", "cases", "cert. %", "wrong", "missed", "better", "angle", "95 %", "ratio", "worst"),
-    *("µs", "x lsq", "µs batch", "x lsq"),
+    ("method", "text", "method"),
+    ("cases", "d", "cases"),
+    ("cert. %", ".2f", "certified_percent"),
+    ("wrong", "d", "certified_wrong"),
+    ("missed", "d", "missed"),
+    ("better", "d", "better_than_ours"),
+    ("angle", ".3f", "angle_median_deg"),
+    ("95 %", ".3f", "angle_p95_deg"),
+    ("ratio", ".4f", "residual_ratio_median"),
+    ("worst", ".4g", "residual_ratio_max"),
+    ("µs", ".1f", "us_single"),
+    ("x lsq", ".2f", "single_over_lsq"),
+    ("µs batch", ".2f", "us_batch"),
+    ("x lsq", ".2f", "batch_over_lsq"),
 )
+"""Heading, kind and key."""
 
 
 def table(report: dict) -> str:
@@ -24,53 +37,46 @@ def table(report: dict) -> str:
     by_scenario: dict[str, dict[str, dict]] = {}
     for row in report["rows"]:
         by_scenario.setdefault(row["scenario"], {})[row["method"]] = row
-    solved: list[tuple[str, ...]] = []
+    solved: list[Row] = []
     noisy_shapes = {}
     for title, rows in by_scenario.items():
         if rows["ours"]["ne_percent"] is None:
             solved += [(title,), *(_cells(row, rows["lsq_svd"]) for row in rows.values())]
         else:
             noisy_shapes[title] = rows
-    parts = (render(_COLUMNS, "t" + 13 * "n", solved), _shape_table(noisy_shapes), _summary(report["summary"]))
+    parts = (
+        render([column[:2] for column in _COLUMNS], solved),
+        _shape_table(noisy_shapes),
+        _summary(report["summary"]),
+    )
     return "\n\n".join(parts)
 
 
-def _cells(row: dict, lsq: dict) -> tuple[str, ...]:
-    share = row["certified_share"]
-    single, batch = row["us_single"], row["us_batch"]
-    return (
-        f"  {row['method']}",
-        f"{row['cases']}",
-        cell(None if share is None else 100 * share, 2),
-        cell(row["certified_wrong"], 0),
-        f"{row['missed']}",
-        cell(row["better_than_ours"], 0),
-        cell(row["angle_median_deg"], 3),
-        cell(row["angle_p95_deg"], 3),
-        cell(row["residual_ratio_median"], 4),
-        f"{row['residual_ratio_max']:.4g}",
-        cell(single),
-        cell(single and single / lsq["us_single"], 2),
-        cell(batch, 2),
-        cell(batch and batch / lsq["us_batch"], 2),
-    )
+def _cells(row: dict, lsq: dict) -> Row:
+    share, single, batch = row["certified_share"], row["us_single"], row["us_batch"]
+    shown = {
+        **row,
+        "method": f"  {row['method']}",
+        "certified_percent": None if share is None else 100 * share,
+        "single_over_lsq": single and single / lsq["us_single"],
+        "batch_over_lsq": batch and batch / lsq["us_batch"],
+    }
+    return [shown[key] for *_, key in _COLUMNS]
 
 
 def _shape_table(scenarios: dict[str, dict[str, dict]]) -> str:
-    columns = ("normalised 3D error in %, human poses", *_COLOURS, "cert. %", "wrong")
-    rows = [
-        (
-            title,
-            *(cell(row["ne_percent"], 2) for row in methods.values()),
-            cell(100 * methods["ours"]["certified_share"], 2),
-            f"{methods['ours']['certified_wrong']}",
-        )
-        for title, methods in scenarios.items()
+    columns = [
+        ("normalised 3D error in %, human poses", "text"),
+        *((name, ".2f") for name in (*_COLOURS, "cert. %")),
+        ("wrong", "d"),
     ]
+    rows: list[Row] = []
+    for title, methods in scenarios.items():
+        errors, ours = (row["ne_percent"] for row in methods.values()), methods["ours"]
+        rows.append((title, *errors, 100 * ours["certified_share"], ours["certified_wrong"]))
     first = ", ".join(f"{methods['ours']['ne_percent_first']:.2f}" for methods in scenarios.values())
     count = max(methods["lm_search"]["cases"] for methods in scenarios.values())
-    table = render(columns, "t" + 7 * "n", rows)
-    return f"{table}\n  lm_search: mean of the first {count} cases; ours of the same cases: {first}"
+    return f"{render(columns, rows)}\n  lm_search: mean of the first {count} cases; ours of the same cases: {first}"
 
 
 def _summary(summary: dict) -> str:

@@ -32,8 +32,8 @@ examples:
 
 NE is |S - truth| / |truth| of the centred shapes, without alignment. Mirror images look alike under an
 orthographic camera: "flip per frame" may mirror each frame, "one flip for all" only the whole set.
-"Rotated and scaled to fit" is the error of Deep NRSfM (Kong and Lucey, ICCV 2019): the prediction is scaled, and
-rotated or reflected, onto the truth before it is compared. The baseline is the rigid mean shape.
+"Rotated and scaled to fit" is the error of Deep NRSfM (Kong and Lucey, ICCV 2019). It is milder than the other two:
+the prediction is first scaled and rotated or reflected onto the truth. The baseline is the rigid mean shape.
 """
 
 

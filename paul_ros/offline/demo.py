@@ -20,6 +20,7 @@ from paul_ros.offline.replay import NODE_NAME, LiftedFrame, Replay
 from paul_ros.offline.replay import replay as replay_bag
 from paul_ros.offline.report import table
 from paul_ros.offline.shipped_bags import find_bag
+from paul_ros.offline.tables import Row
 from paul_ros.stream.stream import open_stream
 
 BAGS = ("one_person", "two_persons_crossing")
@@ -117,13 +118,13 @@ def _report(done: Replay, live: Live, agreement: dict) -> dict:
     return report
 
 
-def _live_rows(live: dict) -> list[tuple[str, str, str, str]]:
+def _live_rows(live: dict) -> list[Row]:
     """Return the rows of the node below those of the replay."""
     order = "order kept" if live["order_kept"] else "ORDER BROKEN"
     frames = f"of {live['frames_sent']} sent, {live['frames_lost']} lost, {order}"
     return [
         ("node, start to ready", f"{live['start_to_ready_s']:.2f}", "", "s"),
-        ("node, memory", f"{live['rss_mb']:.1f}", "", "MB"),
+        ("node, memory", live["rss_mb"], "", "MB"),
         ("node, frames", f"{live['frames_received']}", "", frames),
         ("live against replay", f"{live['max_difference_relative']:.1e}", "", "of the skeleton at most"),
     ]

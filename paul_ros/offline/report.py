@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import Row, cell, render
 
 _ERROR_ROWS = (
     ("N-MPJPE", "n_mpjpe_mm", "mm"),
@@ -17,7 +17,7 @@ _ERROR_ROWS = (
 )
 
 
-def table(report: dict, further: Sequence[Sequence[str]] = ()) -> str:
+def table(report: dict, further: Sequence[Row] = ()) -> str:
     """Return a report of `evaluate` as text.
 
     Args:
@@ -37,24 +37,25 @@ def table(report: dict, further: Sequence[Sequence[str]] = ()) -> str:
     advice = report["advice"]
     lines += [f"  noted: {count} {what}: {advice[what]}" for what, count in report["noted"].items() if what in advice]
     lines.append("")
-    columns = ("", "", "", "")
-    rows: list[Sequence[str]] = []
+    lifted, rigid = "", ""
+    rows: list[Row] = []
     if report["persons_with_truth"]:
         lines.append(f"  {_who_is_judged(report)}")
-        columns = ("", "lifted", "rigid", "")
-        rows = [(name, cell(report[key]), cell(report["baseline"][key]), unit) for name, key, unit in _ERROR_ROWS]
+        lifted, rigid = "lifted", "rigid"
+        rows = [(name, report[key], report["baseline"][key], unit) for name, key, unit in _ERROR_ROWS]
         rows.append(())
-    return "\n".join([*lines, render(columns, "tnnu", [*rows, *_figures(report), *further])])
+    columns = (("", "text"), (lifted, ".1f"), (rigid, ".1f"), ("", "unit"))
+    return "\n".join([*lines, render(columns, [*rows, *_figures(report), *further])])
 
 
-def _figures(report: dict) -> list[tuple[str, str, str, str]]:
+def _figures(report: dict) -> list[Row]:
     """Return the rows that need no truth: name, figure, "", unit."""
     return [
-        ("reprojection, median", cell(report["reprojection_median_px"]), "", "px"),
-        ("proven optimal", cell(_percent(report["certified_share"])), "", "%"),
-        ("mirror ambiguous", cell(_percent(report["ambiguous_share"])), "", "%"),
-        ("flips in depth", cell(report["flips_per_1000_frames"]), "", "per 1000 pairs of frames"),
-        ("lift, median", cell(report["lift_us_median"]), "", f"µs a frame (99 %: {cell(report['lift_us_p99'])})"),
+        ("reprojection, median", report["reprojection_median_px"], "", "px"),
+        ("proven optimal", _percent(report["certified_share"]), "", "%"),
+        ("mirror ambiguous", _percent(report["ambiguous_share"]), "", "%"),
+        ("flips in depth", report["flips_per_1000_frames"], "", "per 1000 pairs of frames"),
+        ("lift, median", report["lift_us_median"], "", f"µs a frame (99 %: {cell(report['lift_us_p99'])})"),
     ]
 
 

@@ -9,20 +9,22 @@ from itertools import zip_longest
 
 from paul_ros.extras import require
 
-_UNLIMITED = 10_000  # columns of a file or a pipe, so that no line is folded
-_STYLES = {"t": "", "n": "", "u": "dim"}
+Row = Sequence[str | float | None]
+"""Cells from the left: texts are shown as they are, numbers in the format of their column, None as "-"."""
+
+_UNLIMITED = 10_000  # width of a file or a pipe, so that no line is folded
 
 
-def render(columns: Sequence[str], kinds: str, rows: Iterable[Sequence[str]]) -> str:
+def render(columns: Sequence[tuple[str, str]], rows: Iterable[Row]) -> str:
     """Return aligned lines of text.
 
     A terminal gets a bold heading, dim units, and lines of its own width. Only texts and units are folded, between
     words. A file or a pipe gets plain text, a line for each row.
 
     Args:
-        columns: their headings. If all are empty, there is no heading.
-        kinds: a letter for each column: t text (aligned left), n number (aligned right), u unit (aligned left, dim).
-        rows: cells from the left. The cells that a row lacks are empty; a row without cells is an empty line.
+        columns: heading and kind: "text" (aligned left), "unit" (aligned left, dim), or the format of numbers
+            (aligned right), as ".2f". If all headings are empty, none is drawn.
+        rows: the cells that a row lacks are empty; a row without cells is an empty line.
 
     Raises:
         MissingPackageError: rich is not installed.
@@ -34,23 +36,24 @@ def render(columns: Sequence[str], kinds: str, rows: Iterable[Sequence[str]]) ->
     from rich.measure import Measurement
     from rich.table import Table
 
-    rows = list(rows)
+    headings, kinds = zip(*columns)
+    texts = [[cell(value, kind) for value, kind in zip(row, kinds)] for row in rows]
     watched = sys.stdout is not None and sys.stdout.isatty()
     console = Console(
         force_terminal=watched, width=None if watched else _UNLIMITED, markup=False, emoji=False, highlight=False
     )
     style = box.SIMPLE_HEAD if watched else None
-    table = Table(box=style, show_edge=False, show_header=any(columns), header_style="bold")
-    for heading, kind, cells in zip(columns, kinds, zip_longest(columns, *rows, fillvalue="")):
-        is_number = kind == "n"
+    table = Table(box=style, show_edge=False, show_header=any(headings), header_style="bold")
+    for heading, kind, cells in zip(headings, kinds, zip_longest(headings, *texts, fillvalue="")):
+        is_number = kind not in ("text", "unit")
         table.add_column(
             heading,
             justify="right" if is_number else "left",
-            style=_STYLES[kind],
+            style="dim" if kind == "unit" else "",
             no_wrap=is_number,
             min_width=max(map(cell_len, cells if is_number else " ".join(cells).split()), default=0),
         )
-    for row in rows:
+    for row in texts:
         table.add_row(*row)
     # In a narrower terminal, rich would fold numbers and leave out columns.
     least = Measurement.get(console, console.options.update_width(_UNLIMITED), table).minimum
@@ -60,6 +63,8 @@ def render(columns: Sequence[str], kinds: str, rows: Iterable[Sequence[str]]) ->
     return "\n".join(line.rstrip() for line in captured.get().splitlines())
 
 
-def cell(value: float | None, digits: int = 1) -> str:
-    """Return a number as a table's cell; '-' for None."""
-    return "-" if value is None else f"{value:.{digits}f}"
+def cell(value: str | float | None, kind: str = ".1f") -> str:
+    """Return the text of a cell in a column of this kind."""
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else format(value, kind)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`paul evaluate`: a model on unseen frames, or a saved reconstruction, judged against the truth.
 
-A model needs NumPy only, and its table rich: the forward pass is the robot's.  Frames are judged alone, in any order.
+A model needs NumPy only: the forward pass is the robot's.  The table needs rich.  Each frame is judged alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from paul_ros.files import read_npz
 from paul_ros.lifted import AMBIGUOUS, TOO_FEW_POINTS
 from paul_ros.model import Model
 from paul_ros.model_file import load_model
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import Row, render
 from paul_ros.versions import versions
 from training.errors import DataError
 from training.judge.comparison import Comparison, errors
@@ -163,7 +163,7 @@ def _report(compared: Comparison, **about: object) -> dict[str, Any]:
 _ROWS = (
     ("NE, flip per frame", "ne_flip_frame_percent", "%"),
     ("NE, one flip for all", "ne_flip_global_percent", "%"),
-    ("NE, rotated and scaled to fit", "ne_o3_percent", "%, mirror images allowed: milder than the two above"),
+    ("NE, rotated and scaled to fit", "ne_o3_percent", "%, mirror images allowed"),
     ("MPJPE, flip per frame", "mpjpe_flip_frame", ""),
     ("N-MPJPE", "n_mpjpe", ""),
     ("PA-MPJPE", "pa_mpjpe", ""),
@@ -180,25 +180,26 @@ def table(report: dict[str, Any]) -> str:
     """
     length = "mm" if "mpjpe_flip_frame_mm" in report else "units"
     dropped = ", ".join(f"{count} {reason}" for reason, count in report["dropped"].items()) or "none"
-    rows: list[tuple[str, ...]] = []
+    rows: list[Row] = []
     for name, key, unit in _ROWS:
         key = key if key.endswith("percent") else f"{key}_{length}"
         predicted, rigid = report[key], report["baseline"][key]
         if None not in (predicted, rigid):
-            observed = f"{report['observed'][key]:.4g}" if report["observed"] else ""
-            rows.append((name, f"{predicted:.4g}", observed, f"{rigid:.4g}", unit or length))
+            observed = report["observed"][key] if report["observed"] else ""
+            rows.append((name, predicted, observed, rigid, unit or length))
     rows += [
         (),
-        ("mirrored frames", cell(100 * report["flipped_share"], 2), "", "", "%"),
-        ("reprojection, median", cell(report["reprojection_median_percent"], 3), "", "", "% of the extent"),
+        ("mirrored frames", f"{100 * report['flipped_share']:.2f}", "", "", "%"),
+        ("reprojection, median", f"{report['reprojection_median_percent']:.3f}", "", "", "% of the extent"),
     ]
     if report["lift_us_median"] is not None:
-        rows.append(("one frame alone, median", cell(report["lift_us_median"], 0), "", "", "µs"))
+        rows.append(("one frame alone, median", f"{report['lift_us_median']:.0f}", "", "", "µs"))
+    columns = (("", "text"), *((name, ".4g") for name in ("predicted", "x, y seen", "rigid mean")), ("", "unit"))
     lines = [
         f"{report['data']}: {report['judged']} of {report['frames']} frames judged, dropped: {dropped}",
         f"  {100 * report['hidden_share']:.1f} % of the points are hidden; all errors include them",
         "",
-        render(("", "predicted", "x, y seen", "rigid mean", ""), "tnnnu", rows),
+        render(columns, rows),
     ]
     if report["observed"]:
         lines.append("  x, y seen: visible points at their observed x and y, the paper's S_cam; the model gives depth")

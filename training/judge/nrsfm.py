@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import Row, render
 from paul_ros.versions import versions
 from training.errors import DataError
 from training.judge.experiments import (
@@ -148,13 +148,18 @@ def _row(outcome: Outcome, is_chosen: bool) -> dict[str, Any]:
     }
 
 
-_COLUMNS = ("chosen", "median", "best", "worst")
+_RUNS = ("chosen", "median", "best", "worst")
 
 
 def table(report: dict[str, Any]) -> str:
     """Format the measured errors, and below them the published ones, sequence by sequence."""
     hidden = f", {report['hidden_share']:.0%} of the points hidden" if report.get("hidden_share") else ""
-    rows: list[tuple[str, ...]] = []
+    columns = [
+        *((name, "text") for name in ("sequence", "method")),
+        *((name, "") for name in (*_RUNS, "bad")),
+        ("seconds", ".0f"),
+    ]
+    rows: list[Row] = []
     last = None
     for row in report["summary"]:
         name = row["sequence"]
@@ -162,8 +167,7 @@ def table(report: dict[str, Any]) -> str:
         rows.append((name if name != last else "", Path(row["method"]).stem, *_cells(row)))
         last = name
     parts = [
-        f"normalised error in %, depth flip per frame / one flip for all{hidden}\n"
-        + render(("sequence", "method", *_COLUMNS, "bad", "seconds"), "ttnnnnnn", rows),
+        f"normalised error in %, depth flip per frame / one flip for all{hidden}\n" + render(columns, rows),
         *_published_parts(report["published_ne_percent"]),
         "chosen: the seed with the lowest loss, a choice without truth; bad: runs whose NE with one flip is above "
         f"{BAD_BASIN:g} times the median\n"
@@ -172,12 +176,12 @@ def table(report: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
-    """Format the errors of one line."""
+def _cells(row: dict[str, Any]) -> Row:
+    """Return the cells of the errors of one line."""
     pairs = [
-        f"{row[f'{name}_ne_flip_frame_percent']:.2f} / {row[f'{name}_ne_flip_global_percent']:.2f}" for name in _COLUMNS
+        f"{row[f'{name}_ne_flip_frame_percent']:.2f} / {row[f'{name}_ne_flip_global_percent']:.2f}" for name in _RUNS
     ]
-    return [*pairs, bad_runs(row), cell(row["seconds_median"], 0)]
+    return [*pairs, bad_runs(row), row["seconds_median"]]
 
 
 def bad_runs(row: dict[str, Any]) -> str:
@@ -188,8 +192,9 @@ def bad_runs(row: dict[str, Any]) -> str:
 def _published_parts(figures: dict[str, dict[str, float]]) -> list[str]:
     """Return the table of the published figures; none if no sequence has any."""
     methods = list(dict.fromkeys(method for known in figures.values() for method in known))
-    rows = [(name, *(cell(known.get(method), 2) for method in methods)) for name, known in figures.items() if known]
-    return ["published\n" + render(("sequence", *methods), "t" + len(methods) * "n", rows)] if rows else []
+    rows = [(name, *map(known.get, methods)) for name, known in figures.items() if known]
+    columns = [("sequence", "text"), *((method, ".2f") for method in methods)]
+    return [f"published\n{render(columns, rows)}"] if rows else []
 
 
 def write_picture(path: Path, report: dict[str, Any]) -> None:

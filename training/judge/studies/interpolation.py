@@ -13,7 +13,7 @@ from paul_ros.files import write_json
 from paul_ros.model import Model
 from paul_ros.model_file import load_model
 from paul_ros.normalisation import normalise
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import render
 from paul_ros.orthographic_n_point import onp
 from paul_ros.versions import versions
 from training.errors import DataError
@@ -117,18 +117,14 @@ def _farthest(model: Model, sequence: Sequence) -> tuple[int, int]:
 
 def _table(lines: list[dict[str, Any]]) -> str:
     """Format a row a file."""
-    columns = ("", "frames", *map(str, range(1, _SHAPES)), "ends apart")
+    steps = map(str, range(1, _SHAPES))
+    columns = [("", "text"), ("frames", ""), *((name, ".2f") for name in (*steps, "ends apart"))]
     rows = [
-        (
-            line["data"],
-            "{} and {}".format(*line["frames"]),
-            *(cell(value, 2) for value in line["changes_percent"]),
-            cell(line["ends_apart_percent"], 2),
-        )
+        (line["data"], "{} and {}".format(*line["frames"]), *line["changes_percent"], line["ends_apart_percent"])
         for line in lines
     ]
     head = "change from shape to shape in % of the size, along the straight line between two codes"
-    return head + "\n" + render(columns, "t" + _SHAPES * "n" + "n", rows)
+    return head + "\n" + render(columns, rows)
 
 
 def _draw(model: Model, strips: list[dict[str, Any]]) -> Any:

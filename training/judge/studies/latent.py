@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import render
 from training.judge.experiments import Experiment, Outcome, chosen, groups, summary
 from training.judge.pictures import bounding_square, method_style, new_figure
 from training.judge.studies.study import Study
@@ -90,13 +90,15 @@ def table(report: dict[str, Any]) -> str:
             row["sequence"],
             row["cameras"],
             row["method"],
-            cell(row["roughness"], 3),
+            row["roughness"],
             f"{row['chosen_ne_flip_frame_percent']:.2f} / {row['chosen_ne_flip_global_percent']:.2f}",
         )
         for row in report["summary"]
     ]
+    texts = ((name, "text") for name in ("sequence", "cameras", "method"))
+    columns = [*texts, ("roughness", ".3f"), ("NE %", "")]
     return (
-        render(("sequence", "cameras", "method", "roughness", "NE %"), "tttnn", rows) + "\n"
+        render(columns, rows) + "\n"
         "roughness: mean distance of successive frames' codes over that of random pairs; 1 means no order\n"
         "NE: depth flipped per frame / once for all; both figures are of the run with the lowest loss, K = 2"
     )

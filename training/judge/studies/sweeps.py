@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import Row, render
 from training.judge.experiments import Experiment, Outcome, chosen, groups, outcome_row, summary
 from training.judge.nrsfm import bad_runs
 from training.judge.pictures import COLOURS, legend_above, new_figure, percent_axis, titled
@@ -84,18 +84,25 @@ class Sweep:
 
     def table(self, report: dict[str, Any]) -> str:
         """Format a line for each sequence and value."""
-        columns = ("sequence", self.axis, *_FIGURES, "bad", "one flip", "ratio", "seconds")
-        rows, last = [], None
+        columns = [
+            ("sequence", "text"),
+            (self.axis, ""),
+            *((name, ".2f") for name in _FIGURES),
+            ("bad", ""),
+            *((name, ".2f") for name in ("one flip", "ratio")),
+            ("seconds", ".0f"),
+        ]
+        rows: list[Row] = []
+        last = None
         for row in report["summary"]:
             name = row["sequence"] if row["sequence"] != last else ""
             last = row["sequence"]
-            figures = (cell(row[f"{key}_ne_flip_frame_percent"], 2) for key in _FIGURES)
-            one_flip = cell(row["median_ne_flip_global_percent"], 2)
-            more = (bad_runs(row), one_flip, cell(row["ratio"], 2), cell(row["seconds_median"], 0))
+            figures = (row[f"{key}_ne_flip_frame_percent"] for key in _FIGURES)
+            more = (bad_runs(row), row["median_ne_flip_global_percent"], row["ratio"], row["seconds_median"])
             rows.append((name, self.format(row["value"]), *figures, *more))
         return (
             f"normalised error in % over {report['summary'][0]['runs']} seeds, depth flip per frame\n"
-            + render(columns, "t" + 10 * "n", rows)
+            + render(columns, rows)
             + "\none flip: the median with one flip for all frames; bad: runs above three times that; "
             f"ratio: that median over that of {self.reference}"
         )
