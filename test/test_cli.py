@@ -243,6 +243,9 @@ def test_an_import_of_the_program_that_fails_is_a_fault(monkeypatch):
         (["evaluate", "x.npz", "--truth", "y.npz"], "torch", "train"),
         (["evaluate", "human", "y.npz", "--plot", "OUT/p.png"], "matplotlib", "benchmark"),
         (["benchmark", "nrsfm", "--data", "OUT", "--work", "OUT"], "torch", "train"),
+        (["benchmark", "node"], "rich", "benchmark"),
+        (["evaluate", "human", "y.npz"], "rich", "train"),
+        (["replay", "x.mcap"], "rich", "bags"),
         (["benchmark", "node", "--plot", "OUT/p.png"], "matplotlib", "benchmark"),
     ],
 )

@@ -15,7 +15,7 @@ from paul_ros.cli.options import (
     add_person_height,
     add_topics,
 )
-from paul_ros.cli.output import check_files, publish
+from paul_ros.cli.output import STDOUT, check_files, publish
 from paul_ros.cli.progress import progress
 
 _DESCRIPTION = """\
@@ -87,6 +87,7 @@ def run(args: argparse.Namespace) -> None:
         BagError: the bag is damaged (after all was written), or nobody could be lifted.
     """
     from paul_ros.errors import BagError
+    from paul_ros.extras import require
     from paul_ros.offline.judge import evaluate
     from paul_ros.offline.picture import write_picture
     from paul_ros.offline.replay import Topics, replay
@@ -94,6 +95,8 @@ def run(args: argparse.Namespace) -> None:
     from paul_ros.stream.stream import open_stream
 
     check_files([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
+    if args.json != STDOUT:
+        require("bags", "rich")
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
     parameters = {name: getattr(args, name) for name in ("output_layout", "person_height", "smoothing")}
     stream = open_stream(args.model, args.layout, **parameters)
