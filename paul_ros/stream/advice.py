@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from msg_adapters import Intrinsics, WrongPointCount
 from paul_ros.layout import Layout, layout_names
+from paul_ros.stream.layout_search import candidates
 
 
 def sentence(text: str) -> str:
@@ -41,15 +40,10 @@ def unlike_the_model(model: str, layout: str) -> str:
     )
 
 
-def wrong_point_count(error: WrongPointCount, usable: Iterable[Layout]) -> str:
-    """Say which layouts have as many points as the message.
-
-    Args:
-        error: of the message.
-        usable: the model's own layout, and the shipped ones that map onto it.
-    """
+def wrong_point_count(error: WrongPointCount, model: Layout) -> str:
+    """Say which layouts have as many points as a message: the model's own, and shipped ones that map onto it."""
     shipped = layout_names()
-    fitting = {layout.name: None for layout in usable if error.fits(len(layout.names))}
+    fitting = {layout.name: None for layout in candidates(model) if error.fits(len(layout.names))}
     names = [name if name in shipped else f"{name} (the model's own, by the path of its file)" for name in fitting]
     if not names:
         return (

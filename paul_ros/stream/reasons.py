@@ -223,8 +223,8 @@ _ALL = (
         "unlike_the_model",
         NOTE,
         "The keypoints of a person hardly fit any shape of the model",
-        "If many persons are counted, set `layout` (paul: `--layout`) to the layout of your detector, or train the model "
-        "on more poses.",
+        "If many persons are counted, set `layout` (paul: `--layout`) to the layout of your detector, or train the "
+        "model on more poses.",
     ),
     Reason(
         "stamp_backwards",

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import enum
-import functools
 import logging
 import time
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ from paul_ros.route import Route, find_output_layout
 from paul_ros.stream import advice
 from paul_ros.stream.depth import SURFACE
 from paul_ros.stream.frame import Frame
-from paul_ros.stream.layout_search import candidates, read_in_fitting_layout
+from paul_ros.stream.layout_search import read_in_fitting_layout
 from paul_ros.stream.parameters import checked
 from paul_ros.stream.person_group import PersonGroup
 from paul_ros.stream.reasons import REASONS
@@ -233,7 +232,7 @@ class LiftStream:
         try:
             yield
         except WrongPointCount as error:
-            self.ledger.drop(error.reason, advice.wrong_point_count(error, self._usable_layouts))
+            self.ledger.drop(error.reason, advice.wrong_point_count(error, self.lifter.model.layout))
         except MessageError as error:
             self.ledger.drop(error.reason, advice.sentence(str(error)))
         except Exception as error:
@@ -262,10 +261,6 @@ class LiftStream:
             "model_sha256": model.sha256,
             "metres_per_unit": self.lifter.metres_per_unit,
         }
-
-    @functools.cached_property
-    def _usable_layouts(self) -> list[Layout]:
-        return candidates(self.lifter.model.layout)
 
     def _read(self, type_name: str, msg: Any, topic: str) -> Keypoints2D:
         """Read a message into the model's layout; the first that shows a person fixes the input's layout."""
