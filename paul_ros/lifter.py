@@ -44,14 +44,6 @@ _FARTHEST_PIXEL = 1e6
 class Lifter:
     """Lift every person of every frame independently: the paper's section 4.2, "Prediction on unseen data".
 
-    Args:
-        model: a Model, the name of a shipped model such as ``"human"``, or the path of a model file.
-        person_height: known height of the persons in metres; 0 if unknown.
-
-    Raises:
-        ModelError: there is no such model, its file is damaged, or it has one fixed scale, which no image has.
-        InputError, ModelError: see ``person_height``.
-
     >>> import numpy as np
     >>> lifter = Lifter("human")
     >>> points = np.random.default_rng(0).uniform(100, 500, (17, 2))
@@ -60,6 +52,15 @@ class Lifter:
     Lifted(1 person, 1 lifted, m, coco17)
     >>> lifted.points.shape
     (1, 17, 3)
+
+    Args:
+        model: a Model, the name of a shipped model such as ``"human"``, or the path of a model file.
+        person_height: known height of the persons in metres; 0 if unknown.
+
+    Raises:
+        ModelError: there is no such model, its file is damaged, or it has one fixed scale, which no image has.
+        ModelError: a height is given, and the model does not know the stature that its metres refer to.
+        InputError: the height is no number of metres.
 
     Attributes:
         model: the shape model.
