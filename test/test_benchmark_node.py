@@ -97,7 +97,7 @@ def test_without_ros_the_error_names_the_cure(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert cli.main(["benchmark", "node"]) == 1
     printed = capsys.readouterr().err.splitlines()[-1]
-    assert "the benchmark needs ROS 2" in printed and "paul_ros[ros]" in printed
+    assert "the benchmark needs ROS 2" in printed and "pip install '.[ros]' in a clone" in printed
 
 
 def test_without_the_recording_the_error_names_the_cure(monkeypatch, capsys):

@@ -215,7 +215,9 @@ def test_a_missing_package_is_one_line(module, monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(["benchmark", "onp", "--cases", "5", "--plot", str(tmp_path / "p.png")]) == 1
     printed = capsys.readouterr()
-    assert printed.err == (f"paul: the Python package '{module}' is missing: pip install 'paul_ros[benchmark]'\n")
+    assert printed.err == (
+        f"paul: the Python package '{module}' is missing: pip install '.[benchmark]' in a clone of paul_ros\n"
+    )
 
 
 @pytest.mark.parametrize("words", [["--cases", "0"], ["--batch", "-3"], ["--cases", "many"]])

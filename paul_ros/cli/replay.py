@@ -105,6 +105,6 @@ def run(args: argparse.Namespace) -> None:
     report = evaluate(done)
     publish(report, table, args.json, (lambda: write_picture(args.plot, done)) if args.plot else None)
     if not report["lifted"] and done.drop_advice:
-        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.drop_advice)}")
+        raise BagError(f"{args.bag}: nobody could be lifted: {' '.join(done.drop_advice)}")
     if done.damage:
         raise done.damage
