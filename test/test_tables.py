@@ -88,5 +88,5 @@ def test_a_cell():
 
 def test_without_rich_the_error_names_the_cure(monkeypatch):
     monkeypatch.setitem(sys.modules, "rich", None)
-    with pytest.raises(MissingPackageError, match="paul_ros\\[bags\\]"):
+    with pytest.raises(MissingPackageError, match="\\.\\[bags\\]"):
         render([("a", "text")], [])

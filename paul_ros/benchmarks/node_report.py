@@ -101,7 +101,7 @@ def _draw_bars(ax: Any, rows: list[dict], key: str, tick: str | None = None) -> 
         if tick:
             ax.scatter(x, [row[tick] for row in own], marker="_", s=200, color=colour, zorder=3)
     ax.set_xticks(range(len(cells)), [f"{persons} at\n{rate:g} Hz" for persons, rate in cells], fontsize=9)
-    ax.set(yscale="log", ylim=(_MIN_US, None), ylabel="µs a frame", xlabel="persons, rate")
+    ax.set(yscale="log", ylim=(_MIN_US, None), ylabel="µs per frame", xlabel="persons, rate")
 
 
 def _short(value: float) -> str:

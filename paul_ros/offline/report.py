@@ -55,7 +55,7 @@ def _figures(report: dict) -> list[Row]:
         ("proven optimal", _percent(report["certified_share"]), "", "%"),
         ("mirror ambiguous", _percent(report["ambiguous_share"]), "", "%"),
         ("flips in depth", report["flips_per_1000_frames"], "", "per 1000 pairs of frames"),
-        ("lift, median", report["lift_us_median"], "", f"µs a frame (99 %: {cell(report['lift_us_p99'])})"),
+        ("lift, median", report["lift_us_median"], "", f"µs per frame (99 %: {cell(report['lift_us_p99'])})"),
     ]
 
 

@@ -31,7 +31,7 @@ class Prediction:
 
     Attributes:
         S: (F,3,P) float32, camera frame, units of W, centred on the mean of the visible points.
-        dropped: (F,) reasons (slugs) why there is no prediction; '' where there is one.
+        dropped: (F,) short names of the reasons why there is no prediction; '' where there is one.
         certified: (F,) bool, the camera is the proven optimum; None if no camera was solved.
         ambiguity: (F,) from 0 to 1, see ``paul_ros.onp``; None if no camera was solved.
     """
