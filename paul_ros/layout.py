@@ -333,6 +333,8 @@ def _read_yaml(path: Path) -> object:
         if path.stat().st_size > _MAX_BYTES:
             raise LayoutError(f"{path.stat().st_size} bytes; a layout has at most {_MAX_BYTES}")
         return yaml.safe_load(path.read_bytes())
+    except FileNotFoundError:
+        raise LayoutError("no such file") from None
     except OSError as error:
         raise LayoutError(error.strerror or str(error)) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -17,6 +17,7 @@ from msg_adapters.outputs import keypoints_cloud
 from paul_ros import __version__, cli
 from paul_ros.cli.launcher import COMMANDS, build_parser
 from paul_ros.cli.progress import progress
+from paul_ros.cli.study import STUDIES
 from paul_ros.offline.bag_writer import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,7 +38,13 @@ def paul(*arguments):
 
 
 @pytest.mark.parametrize(
-    "words", [[], *([name] for name in COMMANDS), *(["benchmark", subject] for subject in ("onp", "nrsfm", "node"))]
+    "words",
+    [
+        [],
+        *([name] for name in COMMANDS),
+        *(["benchmark", subject] for subject in ("onp", "nrsfm", "node")),
+        *(["study", name] for name in (*STUDIES, "interpolation")),
+    ],
 )
 def test_help(words, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")

@@ -252,7 +252,7 @@ def test_all_but_name_names_and_root_may_be_left_out() -> None:
         ("coco", "did you mean 'coco17'"),
         ("Body_25", "did you mean 'body25'"),
         ("excavator", "There are body25, cmu31"),
-        ("nowhere/door.yaml", "nowhere/door.yaml: No such file"),
+        ("nowhere/door.yaml", "nowhere/door.yaml: no such file"),
     ],
 )
 def test_an_unknown_name_is_answered_with_the_known_ones(name: str, advice: str) -> None:

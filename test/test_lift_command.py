@@ -329,7 +329,7 @@ def test_distortion_without_a_rectified_image_is_noted(persons, model_file, tmp_
 @pytest.mark.parametrize(
     "text, clue",
     [
-        (None, "No such file"),
+        (None, "no such file"),
         ("", "has no keys"),
         ("- 1", "has no keys"),
         ("a: [", "neither YAML nor JSON"),

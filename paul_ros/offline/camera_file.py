@@ -73,6 +73,8 @@ def _read(path: Path) -> dict[Any, Any]:
         if path.stat().st_size > _MAX_BYTES:
             raise ParameterError(f"camera file {path} has more than {_MAX_BYTES} bytes: {_CURE}")
         data = yaml.safe_load(path.read_bytes())
+    except FileNotFoundError:
+        raise ParameterError(f"camera file {path}: no such file") from None
     except OSError as error:
         raise ParameterError(f"camera file {path}: {error.strerror or error}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date such as 2020-99-99 is a ValueError
