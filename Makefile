@@ -38,7 +38,7 @@ test: setup $(VENV)/.robot
 	$(PYTEST)
 	@$(MAKE) --no-print-directory lint
 
-# Without nodes, installs, training, pages and long searches: for every save.
+# Without nodes, installs, training, pages and long searches: 1 minute on two idle cores.
 test-fast: setup
 	$(PYTEST) -m "not (dds or install or training or docs or slow)"
 

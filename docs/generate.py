@@ -29,6 +29,8 @@ PAGES = (ROOT / "README.md", ROOT / "benchmarks/RESULTS.md", *sorted((ROOT / "do
 _FIGURE = re.compile(r"(-?\d[\d,]*)(\.\d+)?(\*\*)?<!--([\w.]+)-->")
 _REGION = re.compile(r"(<!-- generated: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _ATTRIBUTE = re.compile(r"^    (\w+): (.*(?:\n        .*)*)", re.MULTILINE)
+_BARE_OPTION = re.compile(r"`[^`]*`|(--\w[\w-]*)")
+_PAGE = re.compile(r"docs/(\w+/\w+\.md)")
 _COMMENT = re.compile(r"^    (\w+): .*?  # (.*)$", re.MULTILINE)
 _SECTION = re.compile(r"\nAttributes:\n(.*?)(?:\n\n|\Z)", re.DOTALL)
 
@@ -100,17 +102,29 @@ def layouts() -> str:
 
 
 def recipes() -> str:
-    """Return a table of the shipped recipes: the comment at the head of each file, and what it sets."""
+    """Return a table of the shipped recipes: the comment at the head of each file, and what it sets.
+
+    A list shows its first item.
+    """
     folder = ROOT / "training/recipes"
     rows = []
     for path in sorted(folder.glob("*.yaml")):
         lines = path.read_text().splitlines()
         head = itertools.takewhile(lambda line: line.startswith("#"), lines)
-        purpose = " ".join(line[2:] for line in head if "SPDX" not in line)
-        sets = [line.split("  #")[0] for line in lines if line and not line.startswith(("#", " "))]
-        shown = (f"{line} ..." if line.endswith(":") else line for line in sets)
-        rows.append((f"`{path.stem}`", purpose, ", ".join(f"`{line}`" for line in shown)))
+        purpose = _PAGE.sub(_link, " ".join(line[2:] for line in head if "SPDX" not in line))
+        sets = [
+            f"{line} [{after.strip(' -')}, ...]" if line.endswith(":") else line.split("  #")[0]
+            for line, after in zip(lines, [*lines[1:], ""])
+            if line and not line.startswith(("#", " "))
+        ]
+        rows.append((f"`{path.stem}`", purpose, ", ".join(f"`{line}`" for line in sets)))
     return table(("recipe", "purpose", "settings"), rows)
+
+
+def _link(match: re.Match) -> str:
+    """Return a link from a page of the reference to the page that a source file names, by that page's title."""
+    title = (ROOT / match[0]).read_text().splitlines()[0].removeprefix("# ")
+    return f"[{title}](../{match[1]})"
 
 
 def settings() -> str:
@@ -194,8 +208,9 @@ def _placeholder(action: argparse.Action) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return text of a parser as a cell or line of Markdown."""
-    return re.sub(r"(\*|<)", r"\\\1", " ".join(text.split()))
+    """Return text of a parser as a cell or line of Markdown; HTML would draw the dashes of a bare option as one."""
+    text = re.sub(r"(\*|<)", r"\\\1", " ".join(text.split()))
+    return _BARE_OPTION.sub(lambda match: f"`{match[1]}`" if match[1] else match[0], text)
 
 
 def table(head: tuple[str, ...], rows: list[tuple]) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert ROS messages to arrays and back: one module a message family, without any knowledge of lifting.
+"""Convert ROS messages to arrays and back: one module per message family, without any knowledge of lifting.
 
 All code is duck-typed over attributes. It reads the messages of rclpy and of rosbags alike, and imports no message
 package. The type name, PACKAGE/msg/NAME, selects the family. Other packages can add families, see
@@ -43,7 +43,7 @@ SUPPORTED = Adapters(
     }
 )
 
-#: The types with one person a message: messages with equal stamps are persons of one image.
+#: The types with one person per message: messages with equal stamps are persons of one image.
 ONE_PERSON = OnePerson(SUPPORTED)
 
 

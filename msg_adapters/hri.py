@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""hri_msgs/Skeleton2D (ROS4HRI, REP-155): one body a message, each body on its own topic.
+"""hri_msgs/Skeleton2D (ROS4HRI, REP-155): one body per message, each body on its own topic.
 
 Coordinates are normalised by the image's width and height. They become pixels here, with the size from CameraInfo:
 normalised coordinates are distorted by the aspect ratio and cannot be lifted. The 18 points have their own order; left

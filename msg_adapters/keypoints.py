@@ -21,7 +21,7 @@ class MessageError(ValueError):
     """A message that cannot be used; the text says what to do.
 
     Attributes:
-        reason: short slug to count by.
+        reason: short name to count by.
     """
 
     def __init__(self, reason: str, advice: str) -> None:
@@ -169,7 +169,7 @@ def _common(own: tuple[str, ...], names: tuple[str, ...]) -> tuple[np.ndarray, n
         raise MessageError(
             "no_common_names",
             f"the layout has none of the message's points ({', '.join(filter(None, own))}); "
-            "set the parameter `layout` to one of the same kind of object",
+            "set `layout` (paul: --layout) to one of the same kind of object",
         )
     here, there = np.array(pairs).T
     return here, there

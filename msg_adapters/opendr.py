@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""opendr_interface/OpenDRPose2D (OpenDR toolkit): whole pixels, one person a message.
+"""opendr_interface/OpenDRPose2D (OpenDR toolkit): whole pixels, one person per message.
 
 Points are placed by name, so their order and number do not matter. A negative coordinate means missing. The message
 has no confidence for each keypoint: conf is the person's, on a scale of its own.
@@ -47,8 +47,8 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
         named = ", ".join(keypoint.kpt_name for keypoint in msg.keypoint_list[:5])
         raise MessageError(
             "no_common_names",
-            f"the layout has none of the message's points ({named} ...); set the parameter `layout` to one with the "
-            "same names",
+            f"the layout has none of the message's points ({named} ...); set `layout` (paul: --layout) to one "
+            "with the same names",
         )
     person = str(msg.pose_id) if msg.pose_id >= 0 else ""
     return record(xy, None, (person,), msg.header, present=np.all(xy >= 0, axis=-1))

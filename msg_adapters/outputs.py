@@ -46,7 +46,7 @@ def pose_array(make: MessageFactory, header: Any, points: np.ndarray) -> Any:
 
 
 def body_array(make: MessageFactory, header: Any, positions: np.ndarray, quaternions: np.ndarray) -> Any:
-    """Make a geometry_msgs/PoseArray with one pose a person: positions (N, 3), quaternions (N, 4) as x, y, z, w."""
+    """Make a geometry_msgs/PoseArray with one pose per person: positions (N, 3), quaternions (N, 4) as x, y, z, w."""
     poses = [
         make("geometry_msgs/msg/Pose", position=_point(make, xyz), orientation=_quaternion(make, *xyzw))
         for xyz, xyzw in zip(positions.tolist(), quaternions.tolist())

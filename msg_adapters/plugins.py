@@ -77,7 +77,7 @@ class Adapters(Mapping[str, "Adapter | Plugin"]):
 
 
 class OnePerson(Container[str]):
-    """The types with one person a message: messages with equal stamps are persons of one image."""
+    """The types with one person per message: messages with equal stamps are persons of one image."""
 
     def __init__(self, adapters: Adapters) -> None:
         self._adapters = adapters

@@ -122,13 +122,13 @@ def _persons_first(cloud: np.ndarray, points: int) -> np.ndarray:
         return cloud.reshape(split_persons(width, points), points)
     if width != points:
         raise WrongPointCount(
-            f"the cloud has {width} keypoints a person (its width), the layout {points}", lambda other: other == width
+            f"the cloud has {width} keypoints per person (its width), the layout {points}", lambda other: other == width
         )
     return cloud
 
 
 def _ids(column: np.ndarray) -> tuple[str, ...]:
-    """Return one id a person from the (N, P) field person_id: the first finite number that is not negative."""
+    """Return one id per person from the (N, P) field person_id: the first finite number that is not negative."""
     column = as_float64(column)
     known = np.isfinite(column) & (column >= 0)
     first = np.take_along_axis(column, known.argmax(axis=1)[:, None], axis=1)[:, 0]

@@ -143,7 +143,7 @@ class Layout:
 
     @functools.cached_property
     def parts(self) -> tuple[Part, ...]:
-        """One part a category, or one part of all points without categories."""
+        """One part per category, or one part of all points without categories."""
         if not self.categories:
             return (Part(tuple(range(len(self.names))), self.edges),)
         own = [(points, set(points)) for points in self.categories.values()]

@@ -33,6 +33,10 @@ MAX_DISTANCE = 200.0
 class Lifted:
     """N persons in 3D.
 
+    >>> from paul_ros.layout import load_layout
+    >>> Lifted.nobody((TOO_FEW_POINTS, TOO_FAR), load_layout("coco17"), units="m")
+    Lifted(2 persons, 0 lifted, m, coco17)
+
     Attributes:
         points: (N,P,3) points of ``layout`` in the camera's optical frame (x right, y down, z forward). They are
             metres from the camera's centre if ``units`` is ``"m"``, else model units from the root. NaN if not lifted.
@@ -53,7 +57,7 @@ class Lifted:
             distance errors of persons in the shipped bags.
         used: (N,P) bool, the points that the person was lifted from: the visible ones without misdetections. Those
             are points beyond 60 degrees from the person's direction, or far from the lifted shape.
-        reason: N slugs, '' if lifted, else why not:
+        reason: N short names, '' if lifted, else why not:
             ``too_few_points``: fewer visible points than the model needs.
             ``degenerate_points``: the points fix no pose. They lie on one line or in two places or, with intrinsics,
             have an rms extent below 1 pixel.
@@ -77,6 +81,12 @@ class Lifted:
     reason: tuple[str, ...]
     units: str
     layout: Layout
+
+    def __repr__(self) -> str:
+        """Return the counts, units and layout; the arrays would fill the screen."""
+        persons = len(self.reason)
+        counts = f"{persons} person{'' if persons == 1 else 's'}, {int(self.ok.sum())} lifted"
+        return f"Lifted({counts}, {self.units}, {self.layout.name})"
 
     @property
     def ok(self) -> np.ndarray:

@@ -48,8 +48,19 @@ class Lifter:
     >>> lifter = Lifter("human")
     >>> points = np.random.default_rng(0).uniform(100, 500, (17, 2))
     >>> lifted = lifter.lift(points, camera=[[600, 0, 320], [0, 600, 240], [0, 0, 1]], layout="coco17")
-    >>> lifted.points.shape, lifted.units, lifted.layout.name
-    ((1, 17, 3), 'm', 'coco17')
+    >>> lifted
+    Lifted(1 person, 1 lifted, m, coco17)
+    >>> lifted.points.shape
+    (1, 17, 3)
+
+    Args:
+        model: a Model, the name of a shipped model such as ``"human"``, or the path of a model file.
+        person_height: known height of the persons in metres; 0 if unknown.
+
+    Raises:
+        ModelError: there is no such model, its file is damaged, or it has one fixed scale, which no image has.
+        ModelError: a height is given, and the model does not know the stature that its metres refer to.
+        InputError: the height is no number of metres.
 
     Attributes:
         model: the shape model.
@@ -58,16 +69,7 @@ class Lifter:
     """
 
     def __init__(self, model: Model | str | os.PathLike[str], person_height: float = 0.0) -> None:
-        """Prepare a model for lifting.
-
-        Args:
-            model: a Model, the name of a shipped model such as ``"human"``, or the path of a model file.
-            person_height: known height of the persons in metres; 0 if unknown.
-
-        Raises:
-            ModelError: there is no such model, its file is damaged, or it has one fixed scale, which no image has.
-            InputError, ModelError: see ``person_height``.
-        """
+        """Prepare a model for lifting; the class has the arguments."""
         if not isinstance(model, Model):
             model = load_model(model)
         if model.scale != "free":

@@ -61,6 +61,12 @@ class OnP(NamedTuple):
     residual_mirror: np.ndarray
     extent: np.ndarray
 
+    def __repr__(self) -> str:
+        """Return the counts; the arrays would fill the screen."""
+        poses = f"{len(self.scale)} pose{'' if len(self.scale) == 1 else 's'}"
+        certified, two_fold = int(self.certified.sum()), int(self.two_fold.sum())
+        return f"OnP({poses}, {int(self.determined.sum())} determined, {certified} certified, {two_fold} two-fold)"
+
     @property
     def ambiguity(self) -> np.ndarray:
         """(N,) in 0..1, residual over that of the second optimum; 0 without a second optimum.
@@ -89,6 +95,8 @@ def onp(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None = None, scale: 
     >>> import numpy as np
     >>> S = np.random.default_rng(0).standard_normal((1, 3, 8))
     >>> pose = onp(S, 5.0 * S[:, :2] + 100.0)
+    >>> pose
+    OnP(1 pose, 1 determined, 1 certified, 0 two-fold)
     >>> float(pose.scale[0].round(3)), pose.translation[0].round(3).tolist(), bool(pose.certified[0])
     (5.0, [100.0, 100.0], True)
     """
@@ -166,7 +174,7 @@ class _Points(NamedTuple):
         return cls(X, w, mean, moments)
 
     def residuals(self, camera: np.ndarray) -> np.ndarray:
-        """Return weighted root mean square distances (N,2) under two cameras (N,2,2,3) a problem."""
+        """Return weighted root mean square distances (N,2) under two cameras per problem (N,2,2,3)."""
         N, P = self.w.shape
         error = (camera.reshape(N, 4, 3) @ self.X[:, :3]).reshape(N, 2, 2, P) - self.X[:, None, 3:]
         square = (error * error).reshape(N, 4, P) @ self.w[..., None]

@@ -43,7 +43,7 @@ def centred_view(xy: np.ndarray, visible: np.ndarray, camera: Intrinsics) -> Cen
 
     Args:
         xy: (N,P,2) pixels of the rectified image; any value where hidden.
-        visible: (N,P) bool, at least one point a person.
+        visible: (N,P) bool, at least one point per person.
         camera: pinhole intrinsics in pixels.
     """
     rays = np.ones((len(xy), 3, xy.shape[1]))
@@ -78,7 +78,7 @@ def place(shape: np.ndarray, turn: np.ndarray, metres_per_unit: np.ndarray | flo
     Args:
         shape: (N,3,P) model units, in the frames of the virtual cameras.
         turn: (N,3,3) rotations from the virtual cameras to the real one.
-        metres_per_unit: metres per model unit, one number or one a person (N,).
+        metres_per_unit: metres per model unit, one number, or one per person (N,).
 
     Returns:
         Points (N,P,3) in metres in the real camera's optical frame (REP-103: z forward, x right, y down).

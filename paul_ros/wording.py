@@ -20,6 +20,6 @@ def did_you_mean(word: str, names: Iterable[str]) -> str:
     return f", did you mean '{near}'?" if near else ""
 
 
-def counted(number: int, noun: str) -> str:
+def quantity(number: int, noun: str) -> str:
     """Return a number and its noun, as in "1 person" and "2 persons"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

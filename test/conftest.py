@@ -64,8 +64,8 @@ MARKERS = {
 }
 #: Packages that a robot may lack. Test modules that import a missing one are not collected.
 OPTIONAL = ("torch", "rosbags", "mcap", "matplotlib", "rich", "tqdm", "scipy", "hypothesis", "catkin_pkg")
-#: Imported late by paul_ros.offline.bag_records.
-BAGS = {"rosbags", "mcap"}
+#: Packages that these modules import late.
+LATE = {"paul_ros.offline.bag_records": {"rosbags", "mcap"}, "paul_ros.offline.tables": {"rich"}}
 MISSING = {package for package in OPTIONAL if importlib.util.find_spec(package) is None}
 
 
@@ -73,7 +73,8 @@ MISSING = {package for package in OPTIONAL if importlib.util.find_spec(package) 
 def packages_of(module: str) -> set[str]:
     """Return the foreign packages that a test module needs, itself or through others."""
     reached = import_graph.reached([module])
-    return {name.partition(".")[0] for name in reached} | (BAGS if "paul_ros.offline.bag_records" in reached else set())
+    late = (LATE[name] for name in reached & LATE.keys())
+    return {name.partition(".")[0] for name in reached}.union(*late)
 
 
 def needs(*packages: str) -> pytest.MarkDecorator:

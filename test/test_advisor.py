@@ -56,10 +56,10 @@ def test_notes_are_warned_of_rarely_and_only_with_advice(advisor, clock, lines):
         ledger.note("distorted_image", "rectify")
         advisor.report_notes(ledger)
         clock[0] += NOTE_SECONDS - 1
-    assert lines == ["distorted_image, 1 so far. rectify"]
+    assert lines == ["noted: distorted_image, 1 so far. rectify"]
     ledger.note("distorted_image", "rectify")
     advisor.report_notes(ledger)
-    assert lines[1:] == ["distorted_image, 3 so far. rectify"]
+    assert lines[1:] == ["noted: distorted_image, 3 so far. rectify"]
 
 
 def test_silence_is_warned_of_and_a_missing_publisher_named(advisor, clock, lines):
@@ -69,16 +69,16 @@ def test_silence_is_warned_of_and_a_missing_publisher_named(advisor, clock, line
     advisor.report_silence(SILENT_SECONDS, "/keypoints", lambda: True)
     clock[0] += WARNING_SECONDS
     advisor.report_silence(60.0, "/keypoints", lambda: False)
-    assert lines[0] == "no keypoints for 5 s on /keypoints"
-    assert lines[1] == "no keypoints for 60 s on /keypoints: nobody publishes it. Remap `keypoints` to your detector."
+    assert lines[0] == "No keypoints for 5 s on /keypoints. Check the detector."
+    assert lines[1] == "No keypoints for 60 s on /keypoints. Nobody publishes it: remap `keypoints` to your detector."
 
 
 def test_model_units_and_a_clock_that_was_set_back(advisor, lines):
-    advisor.report_model_units("none: no usable CameraInfo has come")
-    advisor.report_model_units("none: no usable CameraInfo has come")
+    advisor.report_model_units("none: no usable CameraInfo has been received")
+    advisor.report_model_units("none: no usable CameraInfo has been received")
     advisor.report_clock_set_back(95.0)
     assert lines[0] == (
-        "points are in model units, not metres: no usable CameraInfo has come. "
+        "Points are in model units, not metres: no usable CameraInfo has been received. "
         "Remap `camera_info` to a calibrated camera."
     )
-    assert lines[1:] == ["time was set back by 95.0 s"]
+    assert lines[1:] == ["Time was set back by 95.0 s."]

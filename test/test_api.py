@@ -29,6 +29,7 @@ WITH_EXAMPLES = [
     "paul_ros",
     "paul_ros.body_axes",
     "paul_ros.layout",
+    "paul_ros.lifted",
     "paul_ros.lifter",
     "paul_ros.metrics",
     "paul_ros.model",
@@ -41,7 +42,6 @@ WITHOUT_EXAMPLES = [
     "paul_ros.files",
     "paul_ros.layout_schema",
     "paul_ros.lift_arguments",
-    "paul_ros.lifted",
     "paul_ros.model_file",
     "paul_ros.normalisation",
     "paul_ros.output_files",
@@ -263,3 +263,14 @@ def test_wrong_arguments_are_refused_with_advice(lifter: Lifter, arguments: dict
     with pytest.raises(PaulError, match=advice) as refusal:
         lifter.lift(**given)
     assert isinstance(refusal.value, ValueError) and "\n" not in str(refusal.value)
+
+
+def test_results_print_as_one_short_line(lifter):
+    """Their arrays would fill the screen."""
+    hidden = POINTS.copy()
+    hidden[1] = np.nan
+    assert repr(lifter.lift(hidden, layout="coco17")) == "Lifted(2 persons, 1 lifted, model, coco17)"
+    S = np.random.default_rng(0).standard_normal((3, 3, 8))
+    W = S[:, :2].copy()
+    W[2] = 0
+    assert repr(onp(S, W)) == "OnP(3 poses, 2 determined, 2 certified, 0 two-fold)"

@@ -190,7 +190,8 @@ def test_runs_of_a_recipe_that_restarts_share_no_seed(folder, tmp_path, fake):
 def test_table_has_the_papers_figures_beside_ours(folder, tmp_path, fake, capsys):
     paul(folder, tmp_path, "--seeds", "1", "--plot", str(tmp_path / "b.png"))
     printed = capsys.readouterr()
-    assert "PAUL 0.47" in printed.out and "CVPR 2021" in printed.out
+    head, row = (line.split() for line in printed.out.split("\npublished\n")[1].splitlines()[:2])
+    assert row[0] == "drink" and (head[-1], row[-1]) == ("PAUL", "0.47") and "CVPR 2021" in printed.out
     assert "skipped" in printed.err and "unlabelled" in printed.err
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
 

@@ -199,7 +199,7 @@ def test_replay(model_file, tmp_path):
 @pytest.mark.parametrize(
     "layout, shown, clue",
     [
-        ("human", 17, "set the parameter `layout` to the one your detector uses: coco17, h36m17"),
+        ("human", 17, "Set `layout` (paul: --layout) to the one your detector uses: coco17, h36m17."),
         ("coco17", 3, "too few of its keypoints are visible"),
         ("coco17", 17, ""),
     ],
@@ -289,6 +289,9 @@ def test_an_import_of_the_program_that_fails_is_a_fault(monkeypatch):
         (["evaluate", "x.npz", "--truth", "y.npz"], "torch", "train"),
         (["evaluate", "human", "y.npz", "--plot", "OUT/p.png"], "matplotlib", "benchmark"),
         (["benchmark", "nrsfm", "--data", "OUT", "--work", "OUT"], "torch", "train"),
+        (["benchmark", "node"], "rich", "benchmark"),
+        (["evaluate", "human", "y.npz"], "rich", "train"),
+        (["replay", "x.mcap"], "rich", "bags"),
         (["benchmark", "node", "--plot", "OUT/p.png"], "matplotlib", "benchmark"),
     ],
 )
@@ -296,7 +299,7 @@ def test_a_missing_package_is_one_line(words, module, extra, monkeypatch, tmp_pa
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main([word.replace("OUT", str(tmp_path)) for word in words]) == 1
     error = capsys.readouterr().err
-    assert f"'{module}' is missing: pip install 'paul_ros[{extra}]'" in error and error.count("\n") == 1
+    assert f"'{module}' is missing: pip install '.[{extra}]' in a clone of paul_ros" in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(

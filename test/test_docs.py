@@ -9,6 +9,7 @@ a line with nothing but a file's name in backquotes is that file. All other shel
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import itertools
 import json
 import os
@@ -41,6 +42,8 @@ _BLOCK = re.compile(
 _INLINE = re.compile(r"`(paul \w[^`]*)`")
 #: Topics that may be remapped, and what a node's own name is remapped by.
 TOPICS = {"keypoints", "camera_info", "depth", "__node", "__ns"}
+#: The node's launcher, where `make setup` puts it.
+LAUNCHER = ".venv/lib/paul_ros/lifter"
 #: Words in place of something that a user has.
 _PLACEHOLDER = re.compile(r"COMMAND|\.\.\.")
 
@@ -176,6 +179,11 @@ def test_every_ros_command_names_what_exists(words: list[str]) -> None:
     assert refused_ros(words) == []
 
 
+@pytest.mark.parametrize("words", commands(LAUNCHER, shell_lines))
+def test_every_start_of_the_launcher_names_what_exists(words: list[str]) -> None:
+    assert refused_ros(["run", "paul_ros", Path(LAUNCHER).name, *words]) == []
+
+
 def test_a_ros_command_with_a_wrong_name_is_found() -> None:
     words = ["run", "paul_ros", "lifter", "--ros-args", "-p", "smothing:=1.0", "-r", "keypoint:=/x"]
     assert refused_ros(words) == ["smothing:=1.0", "keypoint:=/x"]
@@ -196,6 +204,8 @@ def test_the_code_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest
     names: dict = {}
     for block in blocks(page):
         if block.file:
+            if block.kind == "python":
+                compile(block.text, block.file, "exec")
             Path(block.file).parent.mkdir(exist_ok=True)
             Path(block.file).write_text(block.text)
         elif block.kind == "python":
@@ -234,6 +244,11 @@ def test_the_keys_of_a_replay_are_those_documented(tmp_path: Path) -> None:
         ROOT,
     )
     assert json.loads(report.read_text()).keys() == first_column("docs/reference/json.md", "## `paul replay`")
+
+
+def test_bare_options_of_a_help_text_become_code() -> None:
+    text = "with --truth, of `paul train --shapes`; * is any"
+    assert script("generate")._escaped(text) == r"with `--truth`, of `paul train --shapes`; \* is any"
 
 
 def test_the_keys_of_a_layout_file_are_those_documented() -> None:
@@ -286,3 +301,6 @@ def test_sphinx_builds_all_pages_without_a_warning(tmp_path: Path) -> None:
     options = ["-W", "--keep-going", "-q", "-b", "html", "-d", str(tmp_path / "doctrees")]
     run([sys.executable, "-m", "sphinx", *options, str(ROOT / "docs"), str(tmp_path / "html")], ROOT)
     assert (tmp_path / "html/tutorials/your_own_object.html").exists()
+    (mathjax,) = re.findall(r'src="([^"]*mathjax[^"]*)"', (tmp_path / "html/explanation/method.html").read_text())
+    offline = importlib.util.find_spec("sphinx-mathjax-offline") is not None
+    assert (tmp_path / "html/explanation" / mathjax.partition("?")[0]).exists() == offline

@@ -269,7 +269,7 @@ def test_mp4_by_ffmpeg(tmp_path, monkeypatch, fails):
 def test_without_matplotlib(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["view", "human", "-o", str(tmp_path / "film.png")]) == 1
-    assert "'matplotlib' is missing: pip install 'paul_ros[bags]'" in capsys.readouterr().err
+    assert "'matplotlib' is missing: pip install '.[bags]' in a clone of paul_ros" in capsys.readouterr().err
 
 
 def test_the_bag_is_never_overwritten(tmp_path, capsys):

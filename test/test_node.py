@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -268,7 +269,7 @@ def test_camera_info_turns_model_units_into_metres(ros, start_lifter, model_file
     bench.until(lambda: int(bench.diagnosed().get("noted_distorted_image", 0)) == 2, "the note")
     assert bench.units() == "m" and bench.lifter.log().count("rectify the image") == 1
     bench.close()
-    assert "ready" in bench.lifter.log()
+    assert "Ready" in bench.lifter.log()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -291,6 +292,32 @@ def test_a_signal_while_the_process_imports_ends_it_cleanly(tmp_path, number):
     env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), str(ROOT)])
     done = subprocess.run(LIFTER, env=env, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def without_rclpy(folder: Path) -> dict[str, str]:
+    """Return an environment in which rclpy cannot be imported."""
+    (folder / "rclpy.py").write_text("raise ModuleNotFoundError(\"No module named 'rclpy'\", name='rclpy')")
+    env = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+    return {**env, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+
+
+@pytest.mark.parametrize("command", [LIFTER, [str(ROOT / "lib/paul_ros/lifter")]])
+def test_without_ros_one_line_names_the_cure(tmp_path, command):
+    env = without_rclpy(tmp_path)
+    env["PATH"] = os.pathsep.join([str(Path(LIFTER[0]).parent), env["PATH"]])
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("lifter: the node needs ROS 2: source /opt/ros/")
+    assert "or pip install '.[ros]' in a clone of paul_ros" in line
+
+
+def test_help_fits_a_terminal_and_has_all_parameters():
+    done = subprocess.run([*LIFTER, "--help"], cwd=ROOT, capture_output=True, text=True, check=True)
+    lines = done.stdout.splitlines()
+    assert max(map(len, lines)) <= 80 and not any(line.startswith("|") for line in lines)
+    for parameter in parameters.PARAMETERS:
+        assert any(line.startswith(f"  {parameter.name} (default ") for line in lines), parameter.name
 
 
 def test_pose_array_of_a_best_effort_publisher(ros, start_lifter, model_file):
@@ -325,7 +352,7 @@ def test_a_detector_of_another_type_is_found_when_the_first_has_gone(ros, start_
     lifter = start_lifter("-p", f"model:={model_file}")
     for kind in ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray"):
         bench = Bench(ros, lifter, kind)
-        bench.until(lambda kind=kind: f"reading {kind}" in lifter.log(), f"a subscription of {kind}")
+        bench.until(lambda kind=kind: f"Reading {kind}" in lifter.log(), f"a subscription of {kind}")
         bench.until(bench.keypoints.get_subscription_count, "the subscription")
         bench.close()
 
@@ -334,7 +361,7 @@ def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, mod
     lifter = start_lifter("-p", f"model:={model_file}", "-p", "input_type:=yolo_msgs/msg/DetectionArray")
     bench = Bench(ros, lifter)
     bench.until(lambda: "yolo_msgs" in lifter.log(), "the warning")
-    assert "install it" in lifter.log()
+    assert "Install it" in lifter.log()
     bench.close()
 
 

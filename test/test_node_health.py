@@ -50,7 +50,7 @@ def test_levels_from_the_first_to_the_last_frame(started):
     assert (values["certified_share"], values["ambiguous_share"]) == ("1.000", "0.000")
     assert values["latency_ms_median"] == "unknown"  # the stamps of these tests follow no clock
     bench.until(lambda: bench.got["diagnostics"][-1][1].level == DiagnosticStatus.STALE, "level STALE")
-    assert re.search(r"no keypoints for \d+ s on /", bench.lifter.log())
+    assert re.search(r"No keypoints for \d+ s on /", bench.lifter.log())
 
 
 def test_latency_is_from_stamp_to_publish(started):
@@ -137,7 +137,7 @@ def test_simulated_time_that_is_set_back(started):
     bench = started("-p", "use_sim_time:=true")
     clock = bench.node.create_publisher(class_of("rosgraph_msgs/msg/Clock"), "/clock", 10)
     bench.matched()
-    warning = "time was set back by 95.0 s"
+    warning = "Time was set back by 95.0 s."
 
     def tick(seconds: int):
         clock.publish(MAKE("rosgraph_msgs/msg/Clock", clock=MAKE("builtin_interfaces/msg/Time", sec=seconds)))

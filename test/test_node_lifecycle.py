@@ -64,7 +64,7 @@ def managed(ros, start_lifter, model_file):
 
 def test_transitions(managed):
     bench = managed("-p", "autostart:=false")
-    assert bench.state() == "unconfigured" and "waiting to be configured" in bench.lifter.log()
+    assert bench.state() == "unconfigured" and "Waiting to be configured" in bench.lifter.log()
     assert not bench.change("activate")
     assert bench.change("configure") and bench.state() == "inactive"
     assert bench.keypoints.get_subscription_count() == bench.camera.get_subscription_count() == 0
@@ -99,7 +99,7 @@ def test_an_active_node_may_be_shut_down_by_a_signal_in_any_state(managed):
         bench = managed("-p", "autostart:=false")
         for label in transitions:
             assert bench.change(label)
-        bench.until(lambda: "waiting" in bench.lifter.log(), "its first word")
+        bench.until(lambda: "Waiting" in bench.lifter.log(), "its first word")
         assert bench.lifter.stop(signal.SIGTERM) == 0
         assert "Traceback" not in bench.lifter.log()
 

@@ -37,7 +37,7 @@ def test_tf_without_its_package_is_refused(start_lifter, model_file):
 def test_missing_annotations_are_logged_in_one_line(start_lifter, model_file):
     lifter = start_lifter("-p", f"model:={model_file}")
     end = time.monotonic() + 20
-    while "ready" not in lifter.log():
+    while "Ready" not in lifter.log():
         assert time.monotonic() < end
         time.sleep(0.05)
     assert lifter.log().count("foxglove_msgs is not installed") == 1
@@ -95,9 +95,9 @@ def test_bodies_are_read_as_their_ids_come_and_go(ros, start_lifter, model_file,
         return any(status.level == b"\x00" and status.message.startswith("0 frames") for status in statuses)
 
     bench.until(well, "level OK while there is nobody")
-    assert f"reading {LIST}" in lifter.log() and "Traceback" not in lifter.log()
+    assert f"Reading {LIST}" in lifter.log() and "Traceback" not in lifter.log()
     bench.show("c", "1st")
-    bench.until(lambda: "bodies that are not read, by their ids: '1st'" in lifter.log(), "the warning")
+    bench.until(lambda: "Bodies that are not read, by their ids: '1st'" in lifter.log(), "the warning")
     bench.close()
 
 

@@ -138,7 +138,7 @@ def test_the_launched_node_comes_up_and_ends_on_sigint(install: Install, model_f
     )
     try:
         seen = ""
-        while "ready" not in seen:
+        while "Ready" not in seen:
             line = node.stdout.readline()
             assert line, f"the node ended with {node.wait()}:\n{seen}"
             seen += line

@@ -50,9 +50,9 @@ def test_silence_is_logged_from_the_start(ros, lifter_node, warnings):
         pipeline._search_input()
     warnings.clear()
     pipeline._report()
-    assert len(warnings) == 1 and re.fullmatch(r"no keypoints for \d+ s on /keypoints", warnings[0])
+    assert len(warnings) == 1 and re.fullmatch(r"No keypoints for \d+ s on /keypoints\. .*", warnings[0])
     detector.destroy_publisher(publisher)
-    while not warnings[-1].endswith("nobody publishes it. Remap `keypoints` to your detector."):
+    while not warnings[-1].endswith("Nobody publishes it: remap `keypoints` to your detector."):
         assert time.monotonic() < end, warnings
         pipeline._report()
     detector.destroy_node()
@@ -64,7 +64,7 @@ def test_notes_are_logged_with_what_to_do(lifter_node, warnings):
     for count in (1, 2):
         lifter_node.pipeline._on_camera_info(distorted)
         lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
-        assert warnings.pop().startswith(f"distorted_image, {count} so far. CameraInfo has distortion but no P")
+        assert warnings.pop().startswith(f"noted: distorted_image, {count} so far. CameraInfo has distortion but no P")
     lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
     assert not warnings
 

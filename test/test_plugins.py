@@ -131,7 +131,7 @@ build("acme_msgs", pathlib.Path(sys.argv[1]), json.loads(sys.argv[2]))
         poses = bench.answer("poses", bench.send(fill)).poses
         found = np.array([(p.position.x, p.position.y, p.position.z) for p in poses]).reshape(2, 17, 3)
         np.testing.assert_allclose(found, TRUE, atol=0.15)
-        assert f"reading {PEOPLE}" in lifter.log() and "coco17" in lifter.log()
+        assert f"Reading {PEOPLE}" in lifter.log() and "coco17" in lifter.log()
     finally:
         bench.close()
         for name in [name for name in sys.modules if name.split(".")[0] == "acme_msgs"]:

@@ -89,7 +89,7 @@ from paul_ros.cli import main
 sys.exit(main(["train", "views.npz", "-o", "m.npz"]) != 1)
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0 and "'torch' is missing: pip install 'paul_ros[train]'" in done.stderr
+    assert done.returncode == 0 and "'torch' is missing: pip install '.[train]' in a clone of paul_ros" in done.stderr
 
 
 def test_models_of_recipes_with_removed_settings_are_loaded(tmp_path):

@@ -18,6 +18,7 @@ from paul_ros.errors import LayoutError, ModelError, ParameterError
 from paul_ros.layout import Layout, load_layout
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
+from paul_ros.stream import advice
 from paul_ros.stream.messages import MessageBuilder
 from paul_ros.stream.stream import LiftStream, Outcome, open_stream
 
@@ -79,6 +80,7 @@ def test_the_description_says_which_matrix_of_camera_info_was_used(stream, make)
     info.p = np.zeros(12)
     stream.camera_info(info)
     assert "CameraInfo's K" in stream.describe()["scale_source"]
+    assert "raw image" in stream.describe()["scale_source"] and "P is not filled" in stream.describe()["scale_source"]
     assert "distortion is not corrected" in stream.describe()["scale_source"]
     # It is used all the same, so it is a note and not a drop.
     assert stream.ledger.notes == {"distorted_image": 1} and not stream.ledger.drops and stream.units == "m"
@@ -221,6 +223,38 @@ def test_a_wrong_number_of_points_names_the_layouts_that_fit(stream, make):
     assert "23" in explanation and "path" in explanation
     assert stream.ledger.drops == {"wrong_point_count": 2}
     assert_lifts(stream, make)
+
+
+def test_only_layouts_that_map_onto_the_model_are_proposed(model_file, make):
+    """Shipped layouts of persons have 17 points, but no point in common with a walker."""
+    model = load_model(model_file)
+    walker = Layout.from_dict({"name": "walker", "names": [f"w{n}" for n in range(17)], "root": ["w0"]})
+    half = Layout.from_dict({"name": "half", "names": [f"w{n}" for n in range(8)], "root": ["w0"]})
+    stream = LiftStream(Lifter(replace(model, layout=walker)), half, 0.3, 64)
+    assert_drops(stream, CLOUD, cloud(make, np.ones((1, 17, 2))))
+    assert stream.ledger.advice["wrong_point_count"] == (
+        "17 keypoints are not a multiple of the layout's 8. Set `layout` (paul: --layout) to the one your detector "
+        "uses: walker (the model's own, by the path of its file)."
+    )
+    assert_drops(stream, CLOUD, cloud(make, np.ones((1, 25, 2))))
+    assert stream.ledger.advice["wrong_point_count"].endswith(
+        "the layout's 8. No shipped layout that the model can use has that many: set `layout` (paul: --layout) to the "
+        "path of your own."
+    )
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("a body has 3 keypoints", "A body has 3 keypoints."),
+        ("row_step 1 is too low; set 2", "row_step 1 is too low; set 2."),
+        ("CameraInfo is odd.", "CameraInfo is odd."),
+        ("3 keypoints", "3 keypoints."),
+        ("", "."),
+    ],
+)
+def test_errors_become_sentences(text, expected):
+    assert advice.sentence(text) == expected
 
 
 def test_stamps_going_backwards_are_used_and_noted(stream, make):

@@ -47,7 +47,7 @@ class Recipe:
     Attributes:
         bottleneck: K, the size of a code. Paper: 4 for small or rigid objects, 8 for articulated ones.
         hidden: layer sizes of f_d from the code upwards; f_e is its reverse.
-        codes: ``encoder``: phi = h(W, M), which lifts unseen frames. ``free``: one code a frame, the paper's NRSfM.
+        codes: ``encoder``: phi = h(W, M), which lifts unseen frames. ``free``: one code per frame, the paper's NRSfM.
         encoder: ``residual``, or ``convolutional`` as in Deep NRSfM; see ``networks.py``.
         scale: ``free``: each frame has its own. ``unit``: orthographic views of one scale, as in NRSfM benchmarks.
         width: of the 2D encoder's residual blocks.
@@ -62,7 +62,7 @@ class Recipe:
             the lower level is solved for each batch, as in the paper.
         generations: of networks. Later ones start from what the last one made of the frames, without the tenth that it
             explained worst: most frames that show the wrong mirror image are in that tenth.
-        batch: frames a step; 0 takes all.
+        batch: frames per step; 0 takes all.
         learning_rate: of Adam, warmed up over 200 steps, then a cosine to zero, in each phase.
         code_learning_rate: of free codes; each belongs to one frame.
         seed: of all random numbers.

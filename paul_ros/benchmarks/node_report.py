@@ -9,28 +9,39 @@ from typing import Any
 import numpy as np
 
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.offline.report import cell
+from paul_ros.offline.tables import render
 
 _COLOURS = {"lifter": "#1f77d0", "echo": "#8a8a8a"}
 _MIN_US = 100  # where the axes of the picture begin
-_HEAD = (
-    f"  {'persons':>7}{'Hz':>6}  {'node':<8}{'sent':>7}{'received':>9}{'median':>9}{'99 %':>9}{'CPU':>9}{'MB':>7}"
-    f"{'x echo':>9}{'99 %':>7}{'+ CPU':>8}"
+_COLUMNS = (
+    ("persons", "d", "persons"),
+    ("Hz", "g", "rate_hz"),
+    ("node", "text", "node"),
+    ("sent", "d", "sent"),
+    ("received", "d", "received"),
+    ("median", ".0f", "latency_median_us"),
+    ("99 %", ".0f", "latency_p99_us"),
+    ("CPU", ".0f", "cpu_us_per_frame"),
+    ("MB", ".1f", "rss_mb"),
+    ("x echo", ".2f", "latency_median_ratio"),
+    ("99 %", ".2f", "latency_p99_ratio"),
+    ("+ CPU", ".0f", "cpu_added_us_per_frame"),
 )
+"""Heading, kind and key."""
 
 
 def table(report: dict) -> str:
     """Return a report as text: a line for each node, number of persons and rate; times in µs."""
     ratios = {(ratio["persons"], ratio["rate_hz"]): ratio for ratio in report["ratios"]}
-    lines = [_HEAD]
+    rows = []
     for row in report["rows"]:
-        line = _line(row)
-        if row["node"] == "lifter":
-            line += _ratio_cells(ratios.get((row["persons"], row["rate_hz"])))
-        lines.append(line)
+        ratio = ratios.get((row["persons"], row["rate_hz"])) if row["node"] == "lifter" else None
+        shown = {**row, **(ratio or {})}
+        rows.append([shown[key] for *_, key in _COLUMNS if key in shown])
     starts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["start_to_first_output_s"].items())
     machine = report["machine"]
-    lines += [
+    lines = [
+        render([column[:2] for column in _COLUMNS], rows),
         "",
         f"  start to first output: {starts}",
         f"  {machine['processor']}, {machine['cpus']} processors, load {machine['load_before']:.1f} before and "
@@ -39,34 +50,13 @@ def table(report: dict) -> str:
     return "\n".join(lines + (_soak_lines(report["soak"]) if "soak" in report else []))
 
 
-def _line(row: dict) -> str:
-    return (
-        f"  {row['persons']:>7}{row['rate_hz']:>6g}  {row['node']:<8}{row['sent']:>7}{row['received']:>9}"
-        f"{cell(row['latency_median_us'], 9, 0)}{cell(row['latency_p99_us'], 9, 0)}"
-        f"{cell(row['cpu_us_per_frame'], 9, 0)}{row['rss_mb']:>7.1f}"
-    )
-
-
-def _ratio_cells(ratio: dict | None) -> str:
-    if ratio is None:
-        return ""
-    return (
-        f"{cell(ratio['latency_median_ratio'], 9, 2)}{cell(ratio['latency_p99_ratio'], 7, 2)}"
-        f"{cell(ratio['cpu_added_us_per_frame'], 8, 0)}"
-    )
-
-
 def _soak_lines(soak: dict) -> list[str]:
     """Return the memory at about twenty times, and its growth."""
     every = max(1, len(soak["memory"]) // 20)
     growth = soak["growth_mb_per_hour"]
     verdict = "too short to tell" if growth is None else f"{growth:+.2f} MB an hour in the second half"
-    return [
-        "",
-        "  minutes    MB",
-        *(f"  {at['s'] / 60:>7.1f}{at['rss_mb']:>8.2f}" for at in soak["memory"][::every]),
-        f"  at most {soak['rss_mb_max']:.2f} MB, {verdict}",
-    ]
+    rows = [(at["s"] / 60, at["rss_mb"]) for at in soak["memory"][::every]]
+    return ["", render((("minutes", ".1f"), ("MB", ".2f")), rows), f"  at most {soak['rss_mb_max']:.2f} MB, {verdict}"]
 
 
 # --- the picture

@@ -9,14 +9,27 @@ from typing import Any
 import numpy as np
 
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.offline.report import cell
+from paul_ros.offline.tables import Row, render
 
 _COLOURS = {"ours": "#111111", "lsq_svd": "#e4572e", "polar": "#f0a030", "majorise": "#1f77d0", "lm_search": "#2a9d50"}
 _MIN_ANGLE = 1e-3  # degrees; smaller angles are drawn here
-_HEAD = (
-    f"  {'method':<10}{'cases':>7}{'cert. %':>9}{'wrong':>6}{'missed':>8}{'better':>7}{'angle':>9}{'95 %':>9}"
-    f"{'ratio':>8}{'worst':>9}{'µs':>9}{'x lsq':>7}{'µs batch':>10}{'x lsq':>7}"
+_COLUMNS = (
+    ("method", "text", "method"),
+    ("cases", "d", "cases"),
+    ("cert. %", ".2f", "certified_percent"),
+    ("wrong", "d", "certified_wrong"),
+    ("missed", "d", "missed"),
+    ("better", "d", "better_than_ours"),
+    ("angle", ".3f", "angle_median_deg"),
+    ("95 %", ".3f", "angle_p95_deg"),
+    ("ratio", ".4f", "residual_ratio_median"),
+    ("worst", ".4g", "residual_ratio_max"),
+    ("µs", ".1f", "us_single"),
+    ("x lsq", ".2f", "single_over_lsq"),
+    ("µs batch", ".2f", "us_batch"),
+    ("x lsq", ".2f", "batch_over_lsq"),
 )
+"""Heading, kind and key."""
 
 
 def table(report: dict) -> str:
@@ -24,44 +37,53 @@ def table(report: dict) -> str:
     by_scenario: dict[str, dict[str, dict]] = {}
     for row in report["rows"]:
         by_scenario.setdefault(row["scenario"], {})[row["method"]] = row
-    lines, noisy_shapes = [_HEAD], {}
+    solved: list[Row] = []
+    noisy_shapes = {}
     for title, rows in by_scenario.items():
         if rows["ours"]["ne_percent"] is None:
-            lines += [title, *(_line(row, rows["lsq_svd"]) for row in rows.values())]
+            solved += [(title,), *(_cells(row, rows["lsq_svd"]) for row in rows.values())]
         else:
             noisy_shapes[title] = rows
-    return "\n".join([*lines, "", *_shape_lines(noisy_shapes), "", *_summary_lines(report["summary"])])
-
-
-def _line(row: dict, lsq: dict) -> str:
-    share = row["certified_share"]
-    single, batch = row["us_single"], row["us_batch"]
-    single_ratio, batch_ratio = single and single / lsq["us_single"], batch and batch / lsq["us_batch"]
-    return (
-        f"  {row['method']:<10}{row['cases']:>7}{cell(None if share is None else 100 * share, 9, 2)}"
-        f"{cell(row['certified_wrong'], 6, 0)}{row['missed']:>8}{cell(row['better_than_ours'], 7, 0)}"
-        f"{row['angle_median_deg']:>9.3f}{row['angle_p95_deg']:>9.3f}"
-        f"{row['residual_ratio_median']:>8.4f}{row['residual_ratio_max']:>9.4g}"
-        f"{cell(single, 9, 1)}{cell(single_ratio, 7, 2)}{cell(batch, 10, 2)}{cell(batch_ratio, 7, 2)}"
+    parts = (
+        render([column[:2] for column in _COLUMNS], solved),
+        _shape_table(noisy_shapes),
+        _summary(report["summary"]),
     )
+    return "\n\n".join(parts)
 
 
-def _shape_lines(scenarios: dict[str, dict[str, dict]]) -> list[str]:
-    names = "".join(f"{name:>11}" for name in _COLOURS)
-    lines = [f"{'normalised 3D error in %, human poses':<42}{names}{'cert. %':>9}{'wrong':>6}"]
-    for title, rows in scenarios.items():
-        errors, ours = "".join(f"{row['ne_percent']:>11.2f}" for row in rows.values()), rows["ours"]
-        lines.append(f"  {title:<40}{errors}{100 * ours['certified_share']:>9.2f}{ours['certified_wrong']:>6}")
-    first = ", ".join(f"{rows['ours']['ne_percent_first']:.2f}" for rows in scenarios.values())
-    count = max(rows["lm_search"]["cases"] for rows in scenarios.values())
-    return [*lines, f"  lm_search: mean of the first {count} cases; ours of the same cases: {first}"]
+def _cells(row: dict, lsq: dict) -> Row:
+    share, single, batch = row["certified_share"], row["us_single"], row["us_batch"]
+    shown = {
+        **row,
+        "method": f"  {row['method']}",
+        "certified_percent": None if share is None else 100 * share,
+        "single_over_lsq": single and single / lsq["us_single"],
+        "batch_over_lsq": batch and batch / lsq["us_batch"],
+    }
+    return [shown[key] for *_, key in _COLUMNS]
 
 
-def _summary_lines(summary: dict) -> list[str]:
+def _shape_table(scenarios: dict[str, dict[str, dict]]) -> str:
+    columns = [
+        ("normalised 3D error in %, human poses", "text"),
+        *((name, ".2f") for name in (*_COLOURS, "cert. %")),
+        ("wrong", "d"),
+    ]
+    rows: list[Row] = []
+    for title, methods in scenarios.items():
+        errors, ours = (row["ne_percent"] for row in methods.values()), methods["ours"]
+        rows.append((title, *errors, 100 * ours["certified_share"], ours["certified_wrong"]))
+    first = ", ".join(f"{methods['ours']['ne_percent_first']:.2f}" for methods in scenarios.values())
+    count = max(methods["lm_search"]["cases"] for methods in scenarios.values())
+    return f"{render(columns, rows)}\n  lm_search: mean of the first {count} cases; ours of the same cases: {first}"
+
+
+def _summary(summary: dict) -> str:
     single, batch = (
         "{0:.2f} to {2:.2f} (median {1:.2f})".format(*summary[f"{key}_over_lsq"]) for key in ("us_single", "us_batch")
     )
-    return [
+    lines = [
         f"ours, over {summary['cases']} problems with noise up to 30 %:",
         f"  certified {100 * summary['certified_share']:.3f} %, in the worst scenario "
         f"{100 * summary['certified_share_least']:.2f} %",
@@ -71,6 +93,7 @@ def _summary_lines(summary: dict) -> list[str]:
         f"{summary['residual_ratio_max']:.9f}",
         f"  time over lsq_svd's, by scenario: one pose {single}; batched {batch}",
     ]
+    return "\n".join(lines)
 
 
 # --- the picture

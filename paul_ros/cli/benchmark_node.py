@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
     """Run the benchmark, write the files, print the table."""
     from paul_ros.extras import require
 
-    require("benchmark", "tqdm", *(["matplotlib"] if args.plot else []))
+    require("benchmark", "tqdm", "rich", *(["matplotlib"] if args.plot else []))
     from paul_ros.benchmarks.node import run as benchmark
     from paul_ros.benchmarks.node import soak
     from paul_ros.benchmarks.node_report import table, write_picture

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> None:
     from paul_ros.extras import require
 
     check_files([args.json, args.plot], args.data.glob("*.npz"))
-    require("train", "torch", "tqdm")
+    require("train", "torch", "tqdm", "rich")
     if args.plot:
         require("benchmark", "matplotlib")
     from training.judge import nrsfm

@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> None:
     """Run the benchmark, write the files, print the table."""
     from paul_ros.extras import require
 
-    require("benchmark", "scipy", "tqdm", *(["matplotlib"] if args.plot else []))
+    require("benchmark", "scipy", "tqdm", "rich", *(["matplotlib"] if args.plot else []))
     from paul_ros.benchmarks.onp import run as benchmark
     from paul_ros.benchmarks.onp_report import table, write_picture
 

@@ -29,6 +29,8 @@ def add_parser(commands: Commands) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the demo."""
+    from paul_ros.extras import require
     from paul_ros.offline.demo import demo
 
+    require("bags", "rich")
     demo(args.out, args.model)

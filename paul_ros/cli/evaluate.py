@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 from paul_ros.cli.options import Commands, HelpFormatter, add_json, add_plot
-from paul_ros.cli.output import check_files, publish
+from paul_ros.cli.output import STDOUT, check_files, publish
 from paul_ros.cli.progress import progress
 
 _DESCRIPTION = "Judge a model on frames it never saw, each lifted alone, or judge a saved reconstruction."
@@ -32,7 +32,8 @@ examples:
 
 NE is |S - truth| / |truth| of the centred shapes, without alignment. Mirror images look alike under an
 orthographic camera: "flip per frame" may mirror each frame, "one flip for all" only the whole set.
-The baseline is the rigid mean shape.
+"Rotated and scaled to fit" is the error of Deep NRSfM (Kong and Lucey, ICCV 2019). It is milder than the other two:
+the prediction is first scaled and rotated or reflected onto the truth. The baseline is the rigid mean shape.
 """
 
 
@@ -66,6 +67,8 @@ def run(args: argparse.Namespace) -> None:
     check_files([args.json, args.plot], [args.model, args.data, args.truth])
     if args.plot:
         require("benchmark", "matplotlib")
+    if args.json != STDOUT:
+        require("train", "rich")
     from training.judge import evaluation
 
     if args.truth:

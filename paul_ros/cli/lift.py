@@ -15,7 +15,7 @@ from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_
 from paul_ros.cli.output import STDOUT, check_files, open_output
 from paul_ros.cli.progress import progress
 from paul_ros.stream.parameters import DEFAULTS
-from paul_ros.wording import counted
+from paul_ros.wording import quantity
 
 if TYPE_CHECKING:
     from msg_adapters import Intrinsics
@@ -177,7 +177,7 @@ def _summary(args: argparse.Namespace, tally: Counter[str], layout: str, units: 
     reasons = _reasons(tally)
     output = "standard output" if args.output == STDOUT else args.output
     return (
-        f"{output}: {tally[_LIFTED]} of {counted(persons, 'person')} lifted, layout {layout}, "
+        f"{output}: {tally[_LIFTED]} of {quantity(persons, 'person')} lifted, layout {layout}, "
         f"units {units}{f'; not lifted: {reasons}' if reasons else ''}"
     )
 

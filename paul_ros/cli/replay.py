@@ -88,6 +88,7 @@ def run(args: argparse.Namespace) -> None:
         BagError: the bag is damaged (after all was written), or nobody could be lifted.
     """
     from paul_ros.errors import BagError
+    from paul_ros.extras import require
     from paul_ros.offline.judge import evaluate
     from paul_ros.offline.picture import write_picture
     from paul_ros.offline.replay import Topics, replay
@@ -97,6 +98,8 @@ def run(args: argparse.Namespace) -> None:
     check_files([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
     check_suffix(args.output, [".mcap"])
     check_suffix(args.plot, PICTURES)
+    if args.json != STDOUT:
+        require("bags", "rich")
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
     parameters = {name: getattr(args, name) for name in ("output_layout", "person_height", "smoothing")}
     stream = open_stream(args.model, args.layout, **parameters)
@@ -108,6 +111,6 @@ def run(args: argparse.Namespace) -> None:
     if written and args.json != STDOUT:
         print(f"written: {', '.join(written)}")
     if not report["lifted"] and done.drop_advice:
-        raise BagError(f"{args.bag}: nobody could be lifted: {'; '.join(done.drop_advice)}")
+        raise BagError(f"{args.bag}: nobody could be lifted: {' '.join(done.drop_advice)}")
     if done.damage:
         raise done.damage

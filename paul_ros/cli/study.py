@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> None:
 
     check_files([args.output / f"{args.study}.{kind}" for kind in ("json", "png")], args.data)
     require("benchmark", "matplotlib")
-    require("train", "torch", "tqdm")
+    require("train", "torch", "tqdm", "rich")
     from training.judge.experiments import SeriesOptions
     from training.judge.studies import registry, study
 
@@ -103,7 +103,7 @@ def run_interpolation(args: argparse.Namespace) -> None:
     from paul_ros.extras import require
 
     check_files([args.output / f"interpolation.{kind}" for kind in ("json", "png")], [args.model, *args.data])
-    require("benchmark", "matplotlib")
+    require("benchmark", "matplotlib", "rich")
     from training.judge.studies import interpolation
 
     print(interpolation.run(args.model, args.data, args.output, args.frames))

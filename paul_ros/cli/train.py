@@ -24,8 +24,9 @@ examples:
                          the run of the lowest final loss is kept
   torchrun --nproc-per-node 4 --no-python paul train views.npz -o model.npz
 
-The run is kept in MODEL.run (or SHAPES.run): checkpoint.pt, log.csv and, if the recipe searches for a start, start.npz.
-The same command continues a stopped run, to the bit. Several processes train as one does, up to rounding.
+The run is kept in MODEL.run (or SHAPES.run): checkpoint.pt, log.csv and, if the recipe
+searches for a start, start.npz. The same command continues a stopped run, to the bit.
+Several processes train as one does, up to rounding.
 """
 
 
@@ -89,7 +90,7 @@ def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         help="npz with W (F,2,P) and optional visible (F,P); a bag of 2D keypoints; or a folder of motion capture of "
-        "people. Several files are recordings of one layout, or else categories of objects, one a file",
+        "people. Several files are recordings of one layout, or else categories of objects, one per file",
     )
     parser.add_argument(
         "--layout",

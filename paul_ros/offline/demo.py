@@ -20,6 +20,7 @@ from paul_ros.offline.replay import NODE_NAME, LiftedFrame, Replay
 from paul_ros.offline.replay import replay as replay_bag
 from paul_ros.offline.report import table
 from paul_ros.offline.shipped_bags import find_bag
+from paul_ros.offline.tables import Row
 from paul_ros.output_files import check_output
 from paul_ros.stream.stream import open_stream
 
@@ -53,7 +54,7 @@ def demo(out: Path, model: str | None = None) -> None:
         done, agreement = compare(replayed, recording)
         reports.append(_report(done, live, agreement))
         write_picture(picture, done)
-        print(table(reports[-1]) + "\n" + _live_table(reports[-1]["live"]) + "\n")
+        print(table(reports[-1], _live_rows(reports[-1]["live"])) + "\n")
         files.append(f"{name}: {recording}, {picture}")
     write_json(out / "report.json", {**reports[0], **dict(zip(BAGS[1:], reports[1:]))})
     print("\n".join((*files, f"both: {out / 'report.json'}")))
@@ -120,18 +121,21 @@ def _report(done: Replay, live: Live, agreement: dict) -> dict:
     return report
 
 
-def _live_table(live: dict) -> str:
+def _live_rows(live: dict) -> list[Row]:
+    """Return the rows of the node below those of the replay."""
     order = "order kept" if live["order_kept"] else "ORDER BROKEN"
-    return "\n".join(
-        [
-            f"  {'node, start to ready':<22}{live['start_to_ready_s']:>9.2f}{'':>9}  s",
-            f"  {'node, memory':<22}{live['rss_mb']:>9.1f}{'':>9}  MB",
-            f"  {'node, frames':<22}{live['frames_received']:>9}{'':>9}  of {live['frames_sent']} sent, "
-            f"{live['frames_lost']} lost, {order}",
-            f"  {'live against replay':<22}{live['max_difference_relative']:>9.1e}{'':>9}  "
+    frames = f"of {live['frames_sent']} sent, {live['frames_lost']} lost, {order}"
+    return [
+        ("node, start to ready", f"{live['start_to_ready_s']:.2f}", "", "s"),
+        ("node, memory", live["rss_mb"], "", "MB"),
+        ("node, frames", f"{live['frames_received']}", "", frames),
+        (
+            "live against replay",
+            f"{live['max_difference_relative']:.1e}",
+            "",
             "largest difference of a coordinate, over the person's size",
-        ]
-    )
+        ),
+    ]
 
 
 def _require_agreement(name: str, live: dict) -> None:

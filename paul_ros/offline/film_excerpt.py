@@ -15,7 +15,7 @@ from paul_ros.offline.bag_records import Record
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.film_files import PICTURES_PER_SECOND
 from paul_ros.offline.replay import Topics, no_keypoints
-from paul_ros.wording import counted
+from paul_ros.wording import quantity
 
 #: Most pictures of a film; a longer bag is shown in larger steps.
 MAX_PICTURES = 200
@@ -97,7 +97,7 @@ class Excerpt:
         """Return one line about what a film of so many pictures shows and leaves out."""
         speed = "in real time" if self.speed < 1.01 else f"{self.speed:.1f} times as fast as real time"
         return (
-            f"{counted(pictures, 'picture')} of {counted(self.messages, 'message')}, "
+            f"{quantity(pictures, 'picture')} of {quantity(self.messages, 'message')}, "
             f"{self.first:.1f} to {self.last:.1f} s of {self.length:.1f} s, {speed}"
         )
 

@@ -60,7 +60,7 @@ class _ModelStage:
         self._draw_shape(0, turning @ self.model.mean_shape, "mean shape")
         for column, (code, share) in enumerate(zip(codes, self.shares), 1):
             shape = swaying @ self.model.decode(code[None])[0]
-            self._draw_shape(column, shape, f"mode {column}: {100 * share:.0f} % of the codes")
+            self._draw_shape(column, shape, f"mode {column}: {100 * share:.0f} % of code variance")
         return self._canvas.pixels()
 
     def _draw_title(self) -> None:

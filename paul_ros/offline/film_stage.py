@@ -18,7 +18,7 @@ from paul_ros.offline.canvas import AMBER, CALM, CAPTION, INK, Canvas, draw_lege
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.skeleton_drawing import draw_skeleton
 from paul_ros.stream.messages import project
-from paul_ros.wording import counted
+from paul_ros.wording import quantity
 
 _TURN = np.radians(3.0)  # of the turntable, a picture
 _FOLLOW_PICTURES = 15  # over which the turntable follows the persons
@@ -101,7 +101,7 @@ class Stage:
         ok = frame.lifted.ok
         doubtful = bool((ok & (frame.lifted.ambiguity >= AMBIGUOUS)).any())
         seconds = self.first + (frame.stamp - self.done.frames[0].stamp) / 1e9
-        persons = counted(len(ok), "person")
+        persons = quantity(len(ok), "person")
         persons += f", {int((~ok).sum())} not lifted" if not ok.all() else ""
         model = self.done.stream.lifter.model.name
         self.canvas.title(

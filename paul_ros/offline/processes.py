@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from paul_ros.errors import MissingPackageError
+from paul_ros.extras import needs_ros
 
 _END_TIMEOUT = 30.0  # seconds for a process to end by itself
 _TERMINATE_TIMEOUT = 5.0  # seconds after SIGTERM until it is killed
@@ -33,9 +34,7 @@ def need_ros(what: str) -> None:
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
-        raise MissingPackageError(
-            f"{what} needs ROS 2: source /opt/ros/jazzy/setup.bash, or pip install 'paul_ros[ros]'"
-        ) from error
+        raise MissingPackageError(needs_ros(what)) from error
 
 
 def ros_environment() -> dict[str, str]:

@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from paul_ros.offline.tables import Row, cell, render
+
 _ERROR_ROWS = (
     ("N-MPJPE", "n_mpjpe_mm", "mm"),
     ("PA-MPJPE", "pa_mpjpe_mm", "mm"),
@@ -13,8 +17,16 @@ _ERROR_ROWS = (
 )
 
 
-def table(report: dict) -> str:
-    """Return a report of `evaluate` as a few aligned lines."""
+def table(report: dict, further: Sequence[Row] = ()) -> str:
+    """Return a report of `evaluate` as text.
+
+    Args:
+        report: of `paul_ros.offline.judge.evaluate`.
+        further: rows below those of the report: name, figure, "", unit.
+
+    Raises:
+        MissingPackageError: rich is not installed.
+    """
     dropped = ", ".join(f"{count} {reason}" for reason, count in report["dropped"].items()) or "nothing"
     lines = [
         f"{report['bag']}",
@@ -24,32 +36,33 @@ def table(report: dict) -> str:
     ]
     advice = report["advice"]
     lines += [f"  noted: {count} {what}: {advice[what]}" for what, count in report["noted"].items() if what in advice]
+    lines.append("")
+    lifted, rigid = "", ""
+    rows: list[Row] = []
     if report["persons_with_truth"]:
-        lines += ["", f"  {_who_is_judged(report)}", f"  {'':<22}{'lifted':>9}{'rigid':>9}"]
-        lines += [
-            f"  {name:<22}{cell(report[key])}{cell(report['baseline'][key])}  {unit}" for name, key, unit in _ERROR_ROWS
-        ]
-    lines += [
-        "",
-        f"  {'reprojection, median':<22}{cell(report['reprojection_median_px'])}{'':>9}  px",
-        f"  {'proven optimal':<22}{cell(_percent(report['certified_share']))}{'':>9}  %",
-        f"  {'mirror ambiguous':<22}{cell(_percent(report['ambiguous_share']))}{'':>9}  %",
-        f"  {'flips in depth':<22}{cell(report['flips_per_1000_frames'])}{'':>9}  per 1000 pairs of frames",
-        f"  {'lift, median':<22}{cell(report['lift_us_median'])}{'':>9}  µs a frame "
-        f"(99 %: {cell(report['lift_us_p99']).strip()})",
+        lines.append(f"  {_who_is_judged(report)}")
+        lifted, rigid = "lifted", "rigid"
+        rows = [(name, report[key], report["baseline"][key], unit) for name, key, unit in _ERROR_ROWS]
+        rows.append(())
+    columns = (("", "text"), (lifted, ".1f"), (rigid, ".1f"), ("", "unit"))
+    return "\n".join([*lines, render(columns, [*rows, *_figures(report), *further])])
+
+
+def _figures(report: dict) -> list[Row]:
+    """Return the rows that need no truth: name, figure, "", unit."""
+    return [
+        ("reprojection, median", report["reprojection_median_px"], "", "px"),
+        ("proven optimal", _percent(report["certified_share"]), "", "%"),
+        ("mirror ambiguous", _percent(report["ambiguous_share"]), "", "%"),
+        ("flips in depth", report["flips_per_1000_frames"], "", "per 1000 pairs of frames"),
+        ("lift, median", report["lift_us_median"], "", f"µs a frame (99 %: {cell(report['lift_us_p99'])})"),
     ]
-    return "\n".join(lines)
 
 
 def _who_is_judged(report: dict) -> str:
     judged, persons, share = (report[key] for key in ("persons_with_truth", "persons", "points_with_truth_share"))
     points = "" if share == 1 else f", over {100 * share:.0f} % of their points"
     return f"errors of {judged} of {persons} persons, {100 * (1 - judged / persons):.1f} % left out{points}"
-
-
-def cell(value: float | None, width: int = 9, digits: int = 1) -> str:
-    """Return a number as a table's cell, aligned right; '-' for None."""
-    return f"{'-':>{width}}" if value is None else f"{value:>{width}.{digits}f}"
 
 
 def _percent(share: float | None) -> float | None:

@@ -60,22 +60,24 @@ class Advisor:
             count = ledger.notes[reason]
             if count != self._notes[reason]:
                 self._notes[reason] = count
-                self._log(reason, f"{reason}, {count} so far. {ledger.advice[reason]}", NOTE_SECONDS)
+                self._log(reason, f"noted: {reason}, {count} so far. {ledger.advice[reason]}", NOTE_SECONDS)
 
     def report_silence(self, seconds: float, topic: str, has_publisher: Callable[[], bool]) -> None:
         """Warn if no keypoints have come on a topic for a while; `has_publisher` is called only then."""
         if seconds >= SILENT_SECONDS:
-            advice = "" if has_publisher() else ": nobody publishes it. Remap `keypoints` to your detector."
-            self._log("silent", f"no keypoints for {seconds:.0f} s on {topic}{advice}")
+            advice = (
+                "Check the detector." if has_publisher() else "Nobody publishes it: remap `keypoints` to your detector."
+            )
+            self._log("silent", f"No keypoints for {seconds:.0f} s on {topic}. {advice}")
 
     def report_model_units(self, reason: str) -> None:
         """Warn that points are in model units; the reason is the stream's description of its scale."""
         text = (
-            f"points are in model units, not metres: {reason.removeprefix('none: ')}. "
+            f"Points are in model units, not metres: {reason.removeprefix('none: ')}. "
             "Remap `camera_info` to a calibrated camera."
         )
         self._log("units", text, NOTE_SECONDS)
 
     def report_clock_set_back(self, seconds: float) -> None:
         """Warn that simulated time was set back."""
-        self._log("clock_set_back", f"time was set back by {seconds:.1f} s")
+        self._log("clock_set_back", f"Time was set back by {seconds:.1f} s.")

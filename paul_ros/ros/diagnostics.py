@@ -121,7 +121,11 @@ class Health:
             return STALE, f"no keypoints for {silence:.0f} s; check the detector"
         warnings = list(self._warnings(drops, silence, stream))
         summary = f"{self._frames} frames since the last report, units: {stream.units}"
-        return (WARN, "; ".join([*warnings, summary])) if warnings else (OK, summary)
+        return (
+            (WARN, "; ".join([*(warning.removesuffix(".") for warning in warnings), summary]))
+            if warnings
+            else (OK, summary)
+        )
 
     def _warnings(self, drops: Counter, silence: float | None, stream: LiftStream) -> Iterator[str]:
         if silence is None:
@@ -203,7 +207,7 @@ def summary(stream: LiftStream) -> str:
     counts = stream.counts
     return (
         f"{counts['frames']} frames, {counts['lifted']} of {counts['persons']} persons lifted, "
-        f"median {median:.0f} µs, p99 {p99:.0f} µs a frame; dropped: {listed(stream.ledger.drops)}"
+        f"median {median:.0f} µs, p99 {p99:.0f} µs per frame; dropped: {listed(stream.ledger.drops)}"
     )
 
 

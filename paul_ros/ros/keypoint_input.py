@@ -90,12 +90,12 @@ class KeypointInput:
         known = [name for name in types if name in readable()]
         if not types:
             self.problem = ""
-            self._warn("no input", f"nobody publishes {self.topic} yet. Remap `keypoints` to your detector.")
+            self._warn("no input", f"Nobody publishes {self.topic} yet. Remap `keypoints` to your detector.")
         elif not known:
             self._report(
                 "unknown type",
-                f"{self.topic} has the type {', '.join(types)}, which cannot be read; "
-                f"publish one of {', '.join(readable())}",
+                f"{self.topic} has the type {', '.join(types)}, which cannot be read. "
+                f"Publish one of {', '.join(readable())}.",
             )
         else:
             self._subscribe(known[0])
@@ -119,8 +119,8 @@ class KeypointInput:
             return False
         self._report(
             "other type",
-            f"{self.topic} has the type {', '.join(types)}, but input_type is {self._wanted}: nothing comes from it; "
-            f"correct input_type, or leave it at {AUTO}",
+            f"{self.topic} has the type {', '.join(types)}, but input_type is {self._wanted}: nothing comes from it. "
+            f"Correct input_type, or leave it at {AUTO}.",
         )
         return True
 
@@ -150,15 +150,15 @@ class KeypointInput:
         except ImportError as error:
             self._report(
                 "no package",
-                f"{self.topic} has the type {type_name}, whose package cannot be imported ({error}); install it or "
-                "source its workspace",
+                f"{self.topic} has the type {type_name}, whose package cannot be imported ({error}). Install it, or "
+                "source its workspace.",
             )
             return
         except RCLPY_REFUSALS as error:
             self._report("impossible", f"{self.topic} cannot be subscribed: {error}")
             return
         self.type_name, self.problem = type_name, ""
-        self._node.get_logger().info(f"reading {type_name} from {self.topic}")
+        self._node.get_logger().info(f"Reading {type_name} from {self.topic}.")
 
     def _create_subscription(self, kind: Any, type_name: str) -> Subscription:
         callback: Callable[..., None] = self._on_list if type_name == LIST else self._reader(type_name, self.topic)
@@ -179,7 +179,7 @@ class KeypointInput:
             names = ", ".join(map(repr, ignored[:5]))
             self._warn(
                 "bodies",
-                f"bodies that are not read, by their ids: {names}. Raise `max_persons`, or publish ids that a topic's "
+                f"Bodies that are not read, by their ids: {names}. Raise `max_persons`, or publish ids that a topic's "
                 "name may hold.",
             )
 

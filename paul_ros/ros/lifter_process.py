@@ -16,7 +16,15 @@ if __name__ == "__main__":
     for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[_variable] = "1"
 
+    try:
+        import rclpy
+    except ImportError as _error:
+        from paul_ros.extras import needs_ros
+
+        sys.exit(f"lifter: {needs_ros('the node')} ({' '.join(str(_error).split())})")
+
 import argparse
+import textwrap
 import threading
 import time
 
@@ -28,7 +36,9 @@ from rclpy.utilities import remove_ros_args
 from paul_ros.ros.node import LifterNode, one_line
 from paul_ros.ros.node_parameters import REFUSALS
 from paul_ros.ros.rclpy_internals import OneThreadExecutor
-from paul_ros.stream.parameters import as_markdown
+from paul_ros.stream.parameters import as_text
+
+_HELP_COLUMNS = 80
 
 _STOP_SECONDS = 0.2
 """Interval in which an idle node checks for a signal to end."""
@@ -48,8 +58,8 @@ def main() -> int:
         print(f"lifter: {one_line(error)}", file=sys.stderr)
         rclpy.try_shutdown()
         return 1
-    state = "ready" if node.active else "waiting to be configured,"
-    node.get_logger().info(f"{state} {_process_seconds():.2f} s after the process started")
+    state = "Ready" if node.active else "Waiting to be configured,"
+    node.get_logger().info(f"{state} {_process_seconds():.2f} s after the process started.")
     spin(node, stop)
     node.end()
     print(node.summary(), file=sys.stderr, flush=True)
@@ -85,10 +95,13 @@ def _parse(argv: list[str]) -> None:
     """Refuse everything but ROS arguments and --help."""
     parser = argparse.ArgumentParser(
         prog="lifter",
-        description="Lift 2D keypoints to 3D. Subscribes to keypoints, camera_info and depth; publishes ~/poses, "
-        "~/bodies, ~/keypoints3d, ~/markers, ~/layout and /diagnostics.",
-        epilog="Set parameters with --ros-args -p NAME:=VALUE, topics with --ros-args -r keypoints:=TOPIC."
-        f"\n\n{as_markdown()}",
+        description=textwrap.fill(
+            "Lift 2D keypoints to 3D. Subscribes to keypoints, camera_info and depth; publishes ~/poses, ~/bodies, "
+            "~/keypoints3d, ~/markers, ~/layout and /diagnostics.",
+            _HELP_COLUMNS,
+        ),
+        epilog="Set parameters with --ros-args -p NAME:=VALUE,\ntopics with --ros-args -r keypoints:=TOPIC.\n\n"
+        f"parameters:\n{as_text(_HELP_COLUMNS)}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.parse_args(remove_ros_args(argv)[1:])

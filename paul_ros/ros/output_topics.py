@@ -60,7 +60,7 @@ class OutputTopics:
         if described == self._described:
             return
         if self._described.get("units", described["units"]) != described["units"]:
-            self._node.get_logger().info(f"Units are now {described['units']}: {described['scale_source']}.")
+            self._node.get_logger().info(_units_changed(described["units"], described["scale_source"]))
         self._described = described
         self._layout.publish(String(data=json.dumps(described)))
 
@@ -97,3 +97,9 @@ class OutputTopics:
             qos_overriding_options=OVERRIDES,
             event_callbacks=publisher_events(resolved, self._on_qos_mismatch),
         )
+
+
+def _units_changed(units: str, scale_source: str) -> str:
+    if units == "m":
+        return f"Output is now in metres. {scale_source}."
+    return f"Output is now in model units: {scale_source.removeprefix('none: ')}."

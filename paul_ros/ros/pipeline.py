@@ -106,7 +106,7 @@ class Pipeline:
             self.flush()
         self.stream, self._announced_route = stream, stream.route
         model = stream.lifter.model
-        self._node.get_logger().info(f"lifting with model {model.name} ({model.sha256[:12]})")
+        self._node.get_logger().info(f"Lifting with model {model.name} ({model.sha256[:12]}).")
 
     def flush(self) -> None:
         """Lift and publish the persons that wait for the rest of their image."""
@@ -200,7 +200,7 @@ class Pipeline:
         """Log the layout of the input once it is found, and publish it before the frame that showed it."""
         self._announced_route = route = self.stream.route
         self._node.get_logger().info(
-            f"{self._input.topic} is taken to have the points of {route.given.name}; set the parameter `layout` if it "
+            f"{self._input.topic} is taken to have the points of {route.given.name}. Set the parameter `layout` if it "
             f"has others. Outputs have the points of {route.output.name}."
         )
         self.publish_layout()

@@ -3,23 +3,31 @@
 
 from __future__ import annotations
 
-import functools
-
 from msg_adapters import Intrinsics, WrongPointCount
-from paul_ros.layout import layout_names, load_layout
+from paul_ros.layout import Layout, layout_names
+from paul_ros.stream.layout_search import candidates
+
+
+def sentence(text: str) -> str:
+    """Return the text of an error as a sentence: with a capital, unless it starts with an identifier, and a stop."""
+    first = text.partition(" ")[0]
+    if first.isalpha() and first.islower():
+        text = text[0].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) -> str:
-    """Say where the outputs have their scale from, or why they have none."""
+    """Say where the outputs have their scale from, or after "none: " why they have none; without a full stop."""
     if metres_per_unit is None:
         return "none: the model does not know its size in metres"
     if intrinsics is None:
-        return "none: no usable CameraInfo has come"
-    image = {"P": "the rectified image", "K": "the raw image, for P is not filled"}[intrinsics.matrix]
-    uncorrected = ", whose distortion is not corrected" if intrinsics.distorted else ""
+        return "none: no usable CameraInfo has been received"
+    image = {"P": "for the rectified image", "K": "for the raw image, because P is not filled"}[intrinsics.matrix]
+    uncorrected = "; its distortion is not corrected" if intrinsics.distorted else ""
     return (
-        "the model's metres per unit; distance from the camera's focal length, "
-        f"CameraInfo's {intrinsics.matrix}: {image}{uncorrected}; both from `depth` where that has a value at the root"
+        "Size: the model's metres per unit. "
+        f"Distance: the focal length in CameraInfo's {intrinsics.matrix} ({image}{uncorrected}). "
+        "A depth image replaces both where it has a value at the root"
     )
 
 
@@ -27,18 +35,19 @@ def unlike_the_model(model: str, layout: str) -> str:
     """Explain that keypoints hardly fit any shape of a model; both arguments are names."""
     return (
         f"The keypoints of a person hardly fit any shape of model '{model}'. If many persons are counted, their points "
-        f"are not in the order of layout '{layout}': set the parameter `layout` to the one your detector uses."
+        f"may have another order than layout '{layout}': set `layout` (paul: --layout) to the one your detector uses. "
+        "Or the model has not seen such poses: train it on more."
     )
 
 
-def wrong_point_count(error: WrongPointCount) -> str:
-    """Say which shipped layouts have as many points as the message."""
-    fitting = [name for name, points in _layout_sizes().items() if error.fits(points)]
-    if not fitting:
-        return f"{error}; no shipped layout has that many: set the parameter `layout` to the path of your own"
-    return f"{error}; set the parameter `layout` to the one your detector uses: {', '.join(fitting)}"
-
-
-@functools.cache
-def _layout_sizes() -> dict[str, int]:
-    return {name: len(load_layout(name).names) for name in layout_names()}
+def wrong_point_count(error: WrongPointCount, model: Layout) -> str:
+    """Say which layouts have as many points as a message: the model's own, and shipped ones that map onto it."""
+    shipped = layout_names()
+    fitting = {layout.name: None for layout in candidates(model) if error.fits(len(layout.names))}
+    names = [name if name in shipped else f"{name} (the model's own, by the path of its file)" for name in fitting]
+    if not names:
+        return (
+            f"{sentence(str(error))} No shipped layout that the model can use has that many: set `layout` (paul: "
+            "--layout) to the path of your own."
+        )
+    return f"{sentence(str(error))} Set `layout` (paul: --layout) to the one your detector uses: {', '.join(names)}."

@@ -159,6 +159,15 @@ def as_markdown() -> str:
     return "\n".join(["| parameter | default | may be set | meaning |", "|---|---|---|---|", *rows]) + "\n"
 
 
+def as_text(columns: int) -> str:
+    """Return the parameters as indented plain text of at most so many columns, for a terminal."""
+    lines = []
+    for parameter in PARAMETERS:
+        lines.append(f"  {parameter.name} (default {_literal(parameter)}; may be set {_changeable(parameter)})")
+        lines += textwrap.wrap(parameter.description, columns, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    return "\n".join(lines)
+
+
 def _literal(parameter: Parameter) -> str:
     """Return the default as YAML and the command line write it."""
     default = parameter.default

@@ -63,13 +63,13 @@ _ALL = (
         "wrong_point_count",
         DROP,
         "The number of keypoints differs from the layout's",
-        "Set the parameter `layout` to the layout of your detector, or to the path of your own layout file.",
+        "Set `layout` (paul: `--layout`) to the layout of your detector, or to the path of your own layout file.",
     ),
     Reason(
         "no_common_names",
         DROP,
         "The message names keypoints, and the layout has none of them",
-        "Set the parameter `layout` to a layout of the same kind of object.",
+        "Set `layout` (paul: `--layout`) to a layout of the same kind of object.",
     ),
     Reason(
         "not_2d",
@@ -223,8 +223,8 @@ _ALL = (
         "unlike_the_model",
         NOTE,
         "The keypoints of a person hardly fit any shape of the model",
-        "If many persons are counted, the points have another order than the layout: set the parameter `layout` to "
-        "the layout of your detector.",
+        "If many persons are counted, set `layout` (paul: `--layout`) to the layout of your detector, or train the "
+        "model on more poses.",
     ),
     Reason(
         "stamp_backwards",

@@ -232,13 +232,13 @@ class LiftStream:
         try:
             yield
         except WrongPointCount as error:
-            self.ledger.drop(error.reason, advice.wrong_point_count(error))
+            self.ledger.drop(error.reason, advice.wrong_point_count(error, self.lifter.model.layout))
         except MessageError as error:
-            self.ledger.drop(error.reason, str(error))
+            self.ledger.drop(error.reason, advice.sentence(str(error)))
         except Exception as error:
             if not self.ledger.drops["internal_error"]:
                 _log.exception("A message could not be lifted. This is a fault of paul_ros: report it with this text.")
-            self.ledger.drop("internal_error", f"{type(error).__name__}: {error}")
+            self.ledger.drop("internal_error", advice.sentence(f"{type(error).__name__}: {error}"))
 
     def describe(self) -> dict[str, Any]:
         """Return what the outputs mean: the content of ~/layout and the head of a report."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`paul evaluate`: a model on unseen frames, or a saved reconstruction, judged against the truth.
 
-A model needs NumPy only: the forward pass is the robot's.  Frames are judged alone, in any order.
+A model needs NumPy only: the forward pass is the robot's.  The table needs rich.  Each frame is judged alone.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from paul_ros.files import read_npz
 from paul_ros.lifted import AMBIGUOUS, TOO_FEW_POINTS
 from paul_ros.model import Model
 from paul_ros.model_file import load_model
+from paul_ros.offline.tables import Row, render
 from paul_ros.versions import versions
 from training.errors import DataError
 from training.judge.comparison import Comparison, errors
@@ -162,7 +163,7 @@ def _report(compared: Comparison, **about: object) -> dict[str, Any]:
 _ROWS = (
     ("NE, flip per frame", "ne_flip_frame_percent", "%"),
     ("NE, one flip for all", "ne_flip_global_percent", "%"),
-    ("NE, O(3) aligned and scaled", "ne_o3_percent", "%  (Deep NRSfM's, milder)"),
+    ("NE, rotated and scaled to fit", "ne_o3_percent", "%, mirror images allowed"),
     ("MPJPE, flip per frame", "mpjpe_flip_frame", ""),
     ("N-MPJPE", "n_mpjpe", ""),
     ("PA-MPJPE", "pa_mpjpe", ""),
@@ -172,28 +173,34 @@ _ROWS = (
 
 
 def table(report: dict[str, Any]) -> str:
-    """Format the report as a few aligned lines."""
-    unit = "mm" if "mpjpe_flip_frame_mm" in report else "units"
+    """Format the report as text.
+
+    Raises:
+        MissingPackageError: rich is not installed.
+    """
+    length = "mm" if "mpjpe_flip_frame_mm" in report else "units"
     dropped = ", ".join(f"{count} {reason}" for reason, count in report["dropped"].items()) or "none"
+    rows: list[Row] = []
+    for name, key, unit in _ROWS:
+        key = key if key.endswith("percent") else f"{key}_{length}"
+        predicted, rigid = report[key], report["baseline"][key]
+        if None not in (predicted, rigid):
+            observed = report["observed"][key] if report["observed"] else ""
+            rows.append((name, predicted, observed, rigid, unit or length))
+    rows += [
+        (),
+        ("mirrored frames", f"{100 * report['flipped_share']:.2f}", "", "", "%"),
+        ("reprojection, median", f"{report['reprojection_median_percent']:.3f}", "", "", "% of the extent"),
+    ]
+    if report["lift_us_median"] is not None:
+        rows.append(("one frame alone, median", f"{report['lift_us_median']:.0f}", "", "", "µs"))
+    columns = (("", "text"), *((name, ".4g") for name in ("predicted", "x, y seen", "rigid mean")), ("", "unit"))
     lines = [
         f"{report['data']}: {report['judged']} of {report['frames']} frames judged, dropped: {dropped}",
         f"  {100 * report['hidden_share']:.1f} % of the points are hidden; all errors include them",
         "",
-        f"  {'':<30}{'predicted':>11}{'x, y seen':>12}{'rigid mean':>12}",
+        render(columns, rows),
     ]
-    for name, key, remark in _ROWS:
-        key = key if key.endswith("percent") else f"{key}_{unit}"
-        predicted, rigid = report[key], report["baseline"][key]
-        if None not in (predicted, rigid):
-            observed = f"{report['observed'][key]:.4g}" if report["observed"] else ""
-            lines.append(f"  {name:<30}{predicted:>11.4g}{observed:>12}{rigid:>12.4g}  {remark or unit}")
-    lines += [
-        "",
-        f"  {'mirrored frames':<30}{100 * report['flipped_share']:>11.2f}{'':>24}  %",
-        f"  {'reprojection, median':<30}{report['reprojection_median_percent']:>11.3f}{'':>24}  % of the extent",
-    ]
-    if report["lift_us_median"] is not None:
-        lines.append(f"  {'one frame alone, median':<30}{report['lift_us_median']:>11.0f}{'':>24}  µs")
     if report["observed"]:
         lines.append("  x, y seen: visible points at their observed x and y, the paper's S_cam; the model gives depth")
     if report["whole_set_mirrored"]:

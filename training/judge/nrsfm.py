@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from paul_ros.offline.tables import Row, render
 from paul_ros.versions import versions
 from training.errors import DataError
 from training.judge.experiments import (
@@ -147,50 +148,53 @@ def _row(outcome: Outcome, is_chosen: bool) -> dict[str, Any]:
     }
 
 
-_COLUMNS = ("chosen", "median", "best", "worst")
+_RUNS = ("chosen", "median", "best", "worst")
 
 
 def table(report: dict[str, Any]) -> str:
-    """Format measured and published errors, sequence by sequence."""
-    head = (
-        f"{'sequence':<12} {'method':<14}" + "".join(f"{name:>17}" for name in _COLUMNS) + f"{'bad':>8}{'seconds':>9}"
-    )
+    """Format the measured errors, and below them the published ones, sequence by sequence."""
     hidden = f", {report['hidden_share']:.0%} of the points hidden" if report.get("hidden_share") else ""
-    lines = [f"normalised error in %, depth flip per frame / one flip for all{hidden}", head]
-    last = ""
+    columns = [
+        *((name, "text") for name in ("sequence", "method")),
+        *((name, "") for name in (*_RUNS, "bad")),
+        ("seconds", ".0f"),
+    ]
+    rows: list[Row] = []
+    last = None
     for row in report["summary"]:
         name = row["sequence"]
-        if last and name != last:
-            lines += _published_lines(report, last)
-        lines.append(f"{name if name != last else '':<12} {Path(row['method']).stem:<14}" + _cells(row))
+        rows += [()] if last not in (None, name) else []
+        rows.append((name if name != last else "", Path(row["method"]).stem, *_cells(row)))
         last = name
-    lines += _published_lines(report, last)
-    return "\n".join(
-        [
-            *lines,
-            "chosen: the seed with the lowest loss, a choice without truth; bad: runs whose NE with one flip is above "
-            f"{BAD_BASIN:g} times the median",
-            f"published: {report['published_source']}; {REMARK}",
-        ]
-    )
+    parts = [
+        f"normalised error in %, depth flip per frame / one flip for all{hidden}\n" + render(columns, rows),
+        *_published_parts(report["published_ne_percent"]),
+        "chosen: the seed with the lowest loss, a choice without truth; bad: runs whose NE with one flip is above "
+        f"{BAD_BASIN:g} times the median\n"
+        f"published: {report['published_source']}; {REMARK}",
+    ]
+    return "\n\n".join(parts)
 
 
-def _cells(row: dict[str, Any]) -> str:
-    """Format the errors of one line."""
-    pairs = (
-        f"{row[f'{name}_ne_flip_frame_percent']:>8.2f} /{row[f'{name}_ne_flip_global_percent']:>7.2f}"
-        for name in _COLUMNS
-    )
-    bad = f"{round(row['bad_basin_share'] * row['runs'])}/{row['runs']}"
-    return "".join(pairs) + f"{bad:>8}{row['seconds_median']:>9.0f}"
+def _cells(row: dict[str, Any]) -> Row:
+    """Return the cells of the errors of one line."""
+    pairs = [
+        f"{row[f'{name}_ne_flip_frame_percent']:.2f} / {row[f'{name}_ne_flip_global_percent']:.2f}" for name in _RUNS
+    ]
+    return [*pairs, bad_runs(row), row["seconds_median"]]
 
 
-def _published_lines(report: dict[str, Any], name: str) -> list[str]:
-    """Return the lines after a sequence: its published figures and an empty line."""
-    figures = report["published_ne_percent"].get(name)
-    if not figures:
-        return [""]
-    return [f"{'':<13}published: " + ", ".join(f"{method} {value:.2f}" for method, value in figures.items()), ""]
+def bad_runs(row: dict[str, Any]) -> str:
+    """Return the number of runs in a bad basin, of all runs, as in "1/10"."""
+    return f"{round(row['bad_basin_share'] * row['runs'])}/{row['runs']}"
+
+
+def _published_parts(figures: dict[str, dict[str, float]]) -> list[str]:
+    """Return the table of the published figures; none if no sequence has any."""
+    methods = list(dict.fromkeys(method for known in figures.values() for method in known))
+    rows = [(name, *map(known.get, methods)) for name, known in figures.items() if known]
+    columns = [("sequence", "text"), *((method, ".2f") for method in methods)]
+    return [f"published\n{render(columns, rows)}"] if rows else []
 
 
 def write_picture(path: Path, report: dict[str, Any]) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from training.errors import MocapError
-from training.people.mocap import CMU31, are_plausible, check_size, fixed_axis_rotations, read_lines
+from training.people.mocap import CMU31, are_plausible, check_size, fixed_axis_rotations, plausible_numbers, read_lines
 
 INCH = 0.0254
 """Metres.  CMU's lengths divided by the skeleton's unit of length are inches (mocap.cs.cmu.edu, Frequently Asked)."""
@@ -151,11 +151,8 @@ class _AsfReader:
 
     def _numbers(self, words: list[str], count: int, what: str) -> np.ndarray:
         """Convert words to so many numbers."""
-        try:
-            numbers = np.array([float(word) for word in words])
-        except ValueError:
-            numbers = np.array([])
-        if len(numbers) != count or not are_plausible(numbers):
+        numbers = plausible_numbers(words, count)
+        if numbers is None:
             raise self._error(f"{what} must be {count} numbers, it is '{' '.join(words)[:40]}'")
         return numbers
 

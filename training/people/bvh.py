@@ -24,7 +24,7 @@ import numpy as np
 
 from training.errors import MocapError
 from training.people.asf_amc import INCH
-from training.people.mocap import CMU31, are_plausible, check_size, fixed_axis_rotations, read_lines
+from training.people.mocap import CMU31, are_plausible, check_size, fixed_axis_rotations, plausible_numbers, read_lines
 
 METRES = INCH / 0.45
 """Metres per unit of length."""
@@ -208,11 +208,8 @@ class _BvhReader:
 
     def _numbers(self, words: list[str], count: int, what: str) -> np.ndarray:
         """Convert words to so many numbers."""
-        try:
-            numbers = np.array([float(word) for word in words])
-        except ValueError:
-            numbers = np.array([])
-        if len(numbers) != count or not are_plausible(numbers):
+        numbers = plausible_numbers(words, count)
+        if numbers is None:
             raise self._error(f"{what} must be {count} numbers, it is '{' '.join(words)[:40]}'")
         return numbers
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,15 @@ def read_lines(path: Path) -> list[str]:
         return path.read_text(encoding="ascii", errors="replace").splitlines()
     except OSError as error:
         raise MocapError(f"{path}: {error.strerror or error}") from None
+
+
+def plausible_numbers(words: Sequence[str], count: int) -> np.ndarray | None:
+    """Convert words to so many plausible numbers; None if they are not."""
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        return None
+    return numbers if len(numbers) == count and are_plausible(numbers) else None
 
 
 def are_plausible(values: np.ndarray) -> bool:

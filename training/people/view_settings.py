@@ -28,7 +28,7 @@ class ViewSettings:
 
     # Poses and persons
     motion: float = 10.0  # a frame is used if a limb has turned by this much since the last used frame
-    views: int = 6  # views a frame, each of another person, by another camera and another detector
+    views: int = 6  # views per frame, each of another person, by another camera and another detector
     stature: float = 0.06  # standard deviation of the logarithm of a factor on the whole body
     proportions: float = 0.04  # the same for each of thighs, shanks, feet, hips, trunk, neck, shoulders and upper arms
     forearm: tuple[float, float] = (1.0, 1.5)  # factor; the capture's radius ends above the wrist (human_points.py)

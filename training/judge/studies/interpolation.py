@@ -13,6 +13,7 @@ from paul_ros.files import write_json
 from paul_ros.model import Model
 from paul_ros.model_file import load_model
 from paul_ros.normalisation import normalise
+from paul_ros.offline.tables import render
 from paul_ros.orthographic_n_point import onp
 from paul_ros.versions import versions
 from training.errors import DataError
@@ -118,15 +119,15 @@ def _farthest(model: Model, sequence: Sequence) -> tuple[int, int]:
 
 
 def _table(lines: list[dict[str, Any]]) -> str:
-    """Format a line a file."""
-    head = "change from shape to shape in % of the size, along the straight line between two codes"
+    """Format a row a file."""
+    steps = map(str, range(1, _SHAPES))
+    columns = [("", "text"), ("frames", ""), *((name, ".2f") for name in (*steps, "ends apart"))]
     rows = [
-        f"{line['data']:<12} frames {line['frames'][0]:>6} and {line['frames'][1]:>6}: "
-        + " ".join(f"{value:6.2f}" for value in line["changes_percent"])
-        + f"   ends apart {line['ends_apart_percent']:.2f}"
+        (line["data"], "{} and {}".format(*line["frames"]), *line["changes_percent"], line["ends_apart_percent"])
         for line in lines
     ]
-    return "\n".join([head, *rows])
+    head = "change from shape to shape in % of the size, along the straight line between two codes"
+    return head + "\n" + render(columns, rows)
 
 
 def _draw(model: Model, strips: list[dict[str, Any]]) -> Any:

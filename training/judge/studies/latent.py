@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from paul_ros.offline.tables import render
 from training.judge.experiments import Experiment, Outcome, chosen, groups, summary
 from training.judge.pictures import bounding_square, method_style, new_figure
 from training.judge.studies.study import Study
@@ -84,18 +85,22 @@ def report(outcomes: list[Outcome]) -> dict[str, Any]:
 
 def table(report: dict[str, Any]) -> str:
     """Format a report."""
-    lines = [
-        f"{row['sequence']:<12}{row['cameras']:<16}{row['method']:<8}{row['roughness']:>10.3f}"
-        f"{row['chosen_ne_flip_frame_percent']:>9.2f} /{row['chosen_ne_flip_global_percent']:>7.2f}"
+    rows = [
+        (
+            row["sequence"],
+            row["cameras"],
+            row["method"],
+            row["roughness"],
+            f"{row['chosen_ne_flip_frame_percent']:.2f} / {row['chosen_ne_flip_global_percent']:.2f}",
+        )
         for row in report["summary"]
     ]
-    return "\n".join(
-        [
-            f"{'sequence':<12}{'cameras':<16}{'method':<8}{'roughness':>10}{'NE %':>18}",
-            *lines,
-            "roughness: mean distance of successive frames' codes over that of random pairs; 1 means no order\n"
-            "NE: depth flipped per frame / once for all; both figures are of the run with the lowest loss, K = 2",
-        ]
+    texts = ((name, "text") for name in ("sequence", "cameras", "method"))
+    columns = [*texts, ("roughness", ".3f"), ("NE %", "")]
+    return (
+        render(columns, rows) + "\n"
+        "roughness: mean distance of successive frames' codes over that of random pairs; 1 means no order\n"
+        "NE: depth flipped per frame / once for all; both figures are of the run with the lowest loss, K = 2"
     )
 
 

@@ -9,10 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from paul_ros.offline.tables import Row, render
 from training.judge.experiments import Experiment, Outcome, chosen, groups, outcome_row, summary
+from training.judge.nrsfm import bad_runs
 from training.judge.pictures import COLOURS, legend_above, new_figure, percent_axis, titled
 from training.judge.studies.study import Study
 from training.judge.truth import Sequence
+
+_FIGURES = ("mean", "deviation", "median", "best", "worst")
 
 
 @dataclass(frozen=True)
@@ -80,31 +84,27 @@ class Sweep:
 
     def table(self, report: dict[str, Any]) -> str:
         """Format a line for each sequence and value."""
-        head = (
-            f"{'sequence':<12}{self.axis:>24}{'mean':>9}{'deviation':>11}{'median':>9}{'best':>8}{'worst':>8}{'bad':>7}"
-            f"{'one flip':>10}{'ratio':>7}{'seconds':>9}"
-        )
-        lines, last = [head], None
+        columns = [
+            ("sequence", "text"),
+            (self.axis, ""),
+            *((name, ".2f") for name in _FIGURES),
+            ("bad", ""),
+            *((name, ".2f") for name in ("one flip", "ratio")),
+            ("seconds", ".0f"),
+        ]
+        rows: list[Row] = []
+        last = None
         for row in report["summary"]:
             name = row["sequence"] if row["sequence"] != last else ""
             last = row["sequence"]
-            mean, deviation, median, best, worst = (
-                row[f"{key}_ne_flip_frame_percent"] for key in ("mean", "deviation", "median", "best", "worst")
-            )
-            bad = f"{round(row['bad_basin_share'] * row['runs'])}/{row['runs']}"
-            ratio = "-" if row["ratio"] is None else f"{row['ratio']:.2f}"
-            lines.append(
-                f"{name:<12}{self.format(row['value']):>24}{mean:>9.2f}{deviation:>11.2f}{median:>9.2f}{best:>8.2f}"
-                f"{worst:>8.2f}{bad:>7}{row['median_ne_flip_global_percent']:>10.2f}{ratio:>7}"
-                f"{row['seconds_median']:>9.0f}"
-            )
-        return "\n".join(
-            [
-                f"normalised error in % over {report['summary'][0]['runs']} seeds, depth flip per frame",
-                *lines,
-                "one flip: the median with one flip for all frames; bad: runs above three times that; "
-                f"ratio: that median over that of {self.reference}",
-            ]
+            figures = (row[f"{key}_ne_flip_frame_percent"] for key in _FIGURES)
+            more = (bad_runs(row), row["median_ne_flip_global_percent"], row["ratio"], row["seconds_median"])
+            rows.append((name, self.format(row["value"]), *figures, *more))
+        return (
+            f"normalised error in % over {report['summary'][0]['runs']} seeds, depth flip per frame\n"
+            + render(columns, rows)
+            + "\none flip: the median with one flip for all frames; bad: runs above three times that; "
+            f"ratio: that median over that of {self.reference}"
         )
 
     def draw(self, outcomes: list[Outcome], report: dict[str, Any]) -> Any:
