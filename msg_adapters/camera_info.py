@@ -13,7 +13,7 @@ from msg_adapters.keypoints import Intrinsics, MessageError
 #: Limits of a focal length in multiples of the image's larger side.
 _FOCAL_PER_SIDE = (0.1, 100.0)
 #: Limits of a focal length in pixels, for messages without an image size.
-_FOCAL_PIXELS = (10.0, 1e6)
+FOCAL_PIXELS = (10.0, 1e6)
 
 
 def read_camera_info(msg: Any) -> Intrinsics:
@@ -39,7 +39,7 @@ def read_camera_info(msg: Any) -> Intrinsics:
 
 
 def _check(matrix: str, fx: float, fy: float, cx: float, cy: float, side: int) -> None:
-    shortest, longest = (limit * side for limit in _FOCAL_PER_SIDE) if side else _FOCAL_PIXELS
+    shortest, longest = (limit * side for limit in _FOCAL_PER_SIDE) if side else FOCAL_PIXELS
     # Comparisons with NaN are false. The principal point of a cropped image may lie outside, but not that far.
     focal_ok = shortest <= fx <= longest and shortest <= fy <= longest
     if not (focal_ok and abs(cx) <= longest and abs(cy) <= longest):

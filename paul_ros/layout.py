@@ -7,7 +7,6 @@ nearly the same place on the body have different names.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import os
 import re
@@ -21,6 +20,7 @@ import yaml
 
 from paul_ros.errors import InputError, LayoutError
 from paul_ros.layout_schema import MIN_POINTS, Pair, Points, parse
+from paul_ros.wording import did_you_mean
 
 _SHIPPED = resources.files("paul_ros") / "layouts"
 _MAX_BYTES = 1_000_000
@@ -324,9 +324,7 @@ def _shipped(name: str) -> Layout:
 
 
 def _unknown(name: str) -> str:
-    close = difflib.get_close_matches(name.lower(), layout_names(), n=1)
-    hint = f", did you mean '{close[0]}'?" if close else "."
-    known = ", ".join(layout_names())
+    hint, known = did_you_mean(name, layout_names()) or ".", ", ".join(layout_names())
     return f"no layout '{name}'{hint} There are {known}; for one of your own give the path of its .yaml"
 
 
@@ -335,12 +333,14 @@ def _read_yaml(path: Path) -> object:
         if path.stat().st_size > _MAX_BYTES:
             raise LayoutError(f"{path.stat().st_size} bytes; a layout has at most {_MAX_BYTES}")
         return yaml.safe_load(path.read_bytes())
+    except FileNotFoundError:
+        raise LayoutError("no such file") from None
     except OSError as error:
         raise LayoutError(error.strerror or str(error)) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, LayoutError):
             raise
-        raise LayoutError(f"no YAML: {' '.join(str(error).split())[:200]}") from None
+        raise LayoutError(f"not YAML: {' '.join(str(error).split())[:200]}") from None
 
 
 def _layouts_onto(target: Layout) -> str:

@@ -7,7 +7,6 @@ comment) are the SHA-256 of all bytes before them, so that every change to the f
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import io
 import json
@@ -25,6 +24,7 @@ from paul_ros.errors import ModelError
 from paul_ros.files import write_atomically
 from paul_ros.layout import Layout
 from paul_ros.model import CONVOLUTIONAL, RESIDUAL, Model, is_upright
+from paul_ros.wording import nearest
 
 FORMAT_VERSION = 1
 DEFAULT_MODEL = "human"
@@ -58,9 +58,9 @@ def load_model(name_or_path: str | os.PathLike[str] = DEFAULT_MODEL) -> Model:
         arrays = _read_arrays(data)
         header = json.loads(bytes(arrays.pop("header")).decode())
     except Exception as error:  # zipfile, zlib, numpy and json report unreadable data in a dozen ways
-        raise ModelError(f"{where} is no model file: {error}") from error
+        raise ModelError(f"{where} is not a model file: {error}") from error
     if not isinstance(header, dict):
-        raise ModelError(f"{where} is no model file: its header is a {type(header).__name__}, not an object")
+        raise ModelError(f"{where} is not a model file: its header is a {type(header).__name__}, not an object")
     if header.get("format") is True or header.get("format") != FORMAT_VERSION:
         raise ModelError(
             f"{where} has format version {header.get('format')}, this paul_ros reads {FORMAT_VERSION}: "
@@ -77,7 +77,7 @@ def load_model(name_or_path: str | os.PathLike[str] = DEFAULT_MODEL) -> Model:
 def _verified_digest(data: bytes, where: str) -> str:
     """Return the checksum in a model file, hexadecimal; raise ModelError if the data do not have it."""
     if not data.startswith(b"PK") or not re.fullmatch(rb"[0-9a-f]{%d}" % _DIGEST_CHARS, data[-_DIGEST_CHARS:]):
-        raise ModelError(f"{where} is no model file, or is truncated (expected the .npz that `paul train` writes)")
+        raise ModelError(f"{where} is not a model file, or is truncated (expected the .npz that `paul train` writes)")
     digest = hashlib.sha256(data[:-_DIGEST_CHARS]).hexdigest()
     if data[-_DIGEST_CHARS:] != digest.encode():
         raise ModelError(f"{where} is damaged (its checksum does not match): copy it again or export it anew")
@@ -99,8 +99,8 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, bytes]:
 def _user_file(text: str) -> Path:
     path = Path(text)
     if not path.is_file():
-        near = difflib.get_close_matches(text, model_names(), n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"shipped models: {', '.join(model_names())}"
+        near = nearest(text, model_names())
+        hint = f"did you mean '{near}'?" if near else f"shipped models: {', '.join(model_names())}"
         raise ModelError(f"no model '{text}': neither a file nor a shipped model; {hint}")
     if path.stat().st_size > _MAX_BYTES:
         raise ModelError(f"model file '{text}' is larger than {_MAX_BYTES >> 20} MiB: not a paul_ros model")

@@ -206,7 +206,7 @@ def test_other_files_are_refused(tmp_path, content, clue):
 
 
 def test_missing_bag(tmp_path):
-    with pytest.raises(BagError, match="no such bag"):
+    with pytest.raises(BagError, match="no such file or folder"):
         list(read_messages(tmp_path / "nowhere.mcap"))
 
 

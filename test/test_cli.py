@@ -17,6 +17,7 @@ from msg_adapters.outputs import keypoints_cloud
 from paul_ros import __version__, cli
 from paul_ros.cli.launcher import COMMANDS, build_parser
 from paul_ros.cli.progress import progress
+from paul_ros.cli.study import STUDIES
 from paul_ros.offline.bag_writer import BagWriter
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,7 +38,13 @@ def paul(*arguments):
 
 
 @pytest.mark.parametrize(
-    "words", [[], *([name] for name in COMMANDS), *(["benchmark", subject] for subject in ("onp", "nrsfm", "node"))]
+    "words",
+    [
+        [],
+        *([name] for name in COMMANDS),
+        *(["benchmark", subject] for subject in ("onp", "nrsfm", "node")),
+        *(["study", name] for name in (*STUDIES, "interpolation")),
+    ],
 )
 def test_help(words, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
@@ -58,7 +65,7 @@ def test_help_names_every_command(capsys):
 
 
 def test_every_module_of_a_command_is_a_command():
-    own = {"launcher", "options", "output", "progress"}
+    own = {"launcher", "options", "output", "parser", "progress"}
     files = {file.stem for file in (ROOT / "paul_ros" / "cli").glob("[a-z]*.py")} - own
     assert {name for name in files if not name.startswith("benchmark_")} == set(COMMANDS)
 
@@ -151,12 +158,41 @@ def test_a_mistyped_command_is_answered_by_the_nearest(word, near, capsys):
     assert end.value.code == 2 and f"no command '{word}', did you mean '{near}'?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "words, usage, clue",
+    [
+        (["lift", "a.npz", "-o", "b.npz", "--layuot", "x"], "paul lift", "--layuot x, did you mean '--layout'?"),
+        (["lift", "a.npz", "-o", "b.npz", "--layuot=x"], "paul lift", "--layuot=x, did you mean '--layout'?"),
+        (["lift", "a.npz", "b.npz", "-o", "c.npz"], "paul lift", "unrecognized arguments: b.npz\n"),
+        (["benchmark", "onp", "--bacth", "3"], "paul benchmark onp", "did you mean '--batch'?"),
+        (["study", "botleneck"], "paul study", "no study 'botleneck', did you mean 'bottleneck'?"),
+        (["benchmark", "onpp"], "paul benchmark", "no subject 'onpp', did you mean 'onp'?"),
+        (["study", "zzz"], "paul study", "no study 'zzz'. There are bottleneck"),
+    ],
+)
+def test_a_mistyped_argument_is_answered_by_the_nearest(words, usage, clue, capsys):
+    """With the usage of the command that was meant, not that of `paul`."""
+    with pytest.raises(SystemExit) as end:
+        cli.main(words)
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.startswith(f"usage: {usage} [") and clue in error
+
+
+def test_a_refused_file_is_named_once_and_without_a_number(monkeypatch, capsys):
+    def refuse(args):
+        raise PermissionError(13, "Permission denied", "x.npz")
+
+    monkeypatch.setattr("paul_ros.cli.inspect.run", refuse)
+    assert cli.main(["inspect", "coco17"]) == 1 and capsys.readouterr().err == "paul: x.npz: Permission denied\n"
+
+
 def test_replay(model_file, tmp_path):
     files = tmp_path / "out.mcap", tmp_path / "r.json", tmp_path / "p.png"
     done = paul("replay", ONE, "--model", model_file, "-o", files[0], "--json", files[1], "--plot", files[2])
     assert done.returncode == 0 and done.stderr == ""
     assert "585 frames, 585 persons, 585 lifted; dropped: nothing" in done.stdout
     assert all(file.stat().st_size for file in files)
+    assert done.stdout.splitlines()[-1] == "written: {}, {}, {}".format(*files)
     assert json.loads(files[1].read_text())["frames"] == 585
 
 
@@ -198,7 +234,7 @@ def test_half_a_bag(model_file, tmp_path):
 @pytest.mark.parametrize(
     "arguments, clue",
     [
-        (["replay", "nowhere.mcap"], "nowhere.mcap: no such bag"),
+        (["replay", "nowhere.mcap"], "nowhere.mcap: no such file or folder"),
         (["replay", ONE, "--model", "nobody"], "no model 'nobody'"),
         (["replay", ONE, "--person-height", "9"], "person_height is 9.0; it must be 0 or 0.3 to 3.0"),
         (["replay", ONE, "--person-height", "1e-9"], "person_height is 1e-09; it must be 0 or 0.3 to 3.0"),
@@ -208,13 +244,23 @@ def test_half_a_bag(model_file, tmp_path):
         (["replay", ONE, "--topic", "/skeletons"], "no messages on /skeletons; the bag holds /camera_info"),
         (["replay", ONE, "--topic", "/camera_info"], "/camera_info is a sensor_msgs/msg/CameraInfo, not readable"),
         (["replay", ONE, "-o", "/proc/nothing/out.mcap"], "cannot write"),
-        (["inspect", "nobody"], "no model 'nobody'"),
-        (["inspect", "nowhere.mcap"], "no such bag"),
+        (["inspect", "zzz"], "no model or layout 'zzz'. Shipped models: human; shipped layouts: body25"),
+        (["inspect", "coc17"], "no model or layout 'coc17', did you mean layout 'coco17'?"),
+        (["inspect", "hunam"], "did you mean model 'human'?"),
+        (["inspect", "nowhere.npz"], "no model 'nowhere.npz'"),
+        (["inspect", "nowhere.mcap"], "no such file or folder"),
+        (["replay", ONE, "-o", "x.bag"], "x.bag: this suffix says no format; name a file that ends in .mcap"),
+        (["replay", ONE, "-o", "-"], "this cannot go to standard output; name a file that ends in .mcap"),
+        (["replay", ONE, "--plot", "x.txt"], "name a file that ends in .png or .svg or .pdf"),
+        (["replay", ONE, "--plot", "-"], "this cannot go to standard output; name a file that ends in .png"),
+        (["view", ONE, "-o", "-"], "-: a film is a file that ends in .gif"),
+        (["demo", "--out", "/proc/nothing"], "cannot write /proc/nothing/report.json"),
+        (["train", "nowhere", "-o", "OUT/m.npz", "--recipe", "defalt"], "no recipe 'defalt', did you mean 'default'?"),
         (["inspect", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
-def test_error_is_one_line(arguments, clue, model_file, capsys):
-    arguments = [str(a) for a in arguments]
+def test_error_is_one_line(arguments, clue, model_file, tmp_path, capsys):
+    arguments = [str(a).replace("OUT", str(tmp_path)) for a in arguments]
     if arguments[0] == "replay" and "--model" not in arguments:
         arguments += ["--model", str(model_file)]
     assert cli.main(arguments) == 1
@@ -293,7 +339,15 @@ def test_inspect_a_damaged_bag(tmp_path, capsys):
     half.write_bytes(ONE.read_bytes()[:500_000])
     assert cli.main(["inspect", str(half)]) == 1
     printed = capsys.readouterr()
-    assert "/keypoints" in printed.out and "damaged after" in printed.err
+    assert "/keypoints" in printed.out and "damaged after" not in printed.out
+    assert "damaged after" in printed.err and printed.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("layout", ["coco17", "cmu31"])
+def test_inspect_prints_no_python(layout, capsys):
+    assert cli.main(["inspect", layout]) == 0
+    printed = capsys.readouterr().out
+    assert "handedness\n  1\n" in printed and not set("{}[]") & set(printed)
 
 
 def test_json_on_standard_output_is_all_that_is_there(model_file):

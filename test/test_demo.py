@@ -12,7 +12,7 @@ from paul_ros.errors import BagError, DemoError
 from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_writer import BagWriter
-from paul_ros.offline.demo import BAGS, compare
+from paul_ros.offline.demo import BAGS, _verdict, compare
 from paul_ros.offline.demo_live import run_live
 from paul_ros.offline.replay import replay
 from paul_ros.offline.shipped_bags import find_bag
@@ -99,3 +99,10 @@ def test_bags_are_found():
     assert [find_bag(name).parent for name in BAGS] == [Path(__file__).resolve().parent.parent / "bags"] * 2
     with pytest.raises(BagError, match="make_bags.py"):
         find_bag("opera")
+
+
+def test_the_verdict_says_how_near_live_and_replay_are():
+    lives = [{"frames_sent": 585, "max_difference_relative": 0.0}, {"frames_sent": 390, "max_difference_relative": 0.0}]
+    assert _verdict(lives) == "demo passed: live output equals replay, 0 of 975 messages lost"
+    lives[1]["max_difference_relative"] = 3e-8
+    assert "differs from replay by less than 1e-06 of a person's size" in _verdict(lives)

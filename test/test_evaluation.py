@@ -394,7 +394,7 @@ def test_a_reconstruction_of_other_frames_is_refused(tmp_path, capsys):
     assert cli.main(["evaluate", saved(tmp_path / "a.npz", made.S[:-1]), "--truth", str(data)]) == 1
     assert "that was reconstructed" in capsys.readouterr().err
     assert cli.main(["evaluate", str(data), "--truth", str(data)]) == 1
-    assert "no saved reconstruction" in capsys.readouterr().err
+    assert "is not a saved reconstruction" in capsys.readouterr().err
 
 
 def test_either_form_names_the_other(model_file, tmp_path, capsys):

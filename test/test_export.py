@@ -14,7 +14,7 @@ from paul_ros.model_file import load_model
 from paul_ros.orthographic_n_point import onp
 from training import export
 from training.categories import joint_layout
-from training.chirality import same_side_share
+from training.chirality import chirality_text, same_side_share
 from training.export import export_model
 from training.loading import load_training_data
 from training.recipe import Recipe
@@ -130,3 +130,16 @@ def test_shapes_are_distinguished_from_mirror_images_of_their_mean(mirrored):
     shapes = Rotation.random(20, random_state=0).as_matrix() @ (mean + 0.05 * rng.standard_normal((20, 3, 9)))
     shapes[:mirrored, 2] *= -1
     assert same_side_share(shapes, mean) == 1 - mirrored / 20
+
+
+def test_an_unknown_chirality_says_why():
+    known = {"known": True, "source": "handedness rule of layout 'x'", "training_share": 0.97}
+    assert chirality_text(known) == "known, handedness rule of layout 'x'"
+    unsure = {**known, "known": False, "training_share": 0.61}
+    assert (
+        chirality_text(unsure)
+        == "UNKNOWN, only 61 % of the frames obey the handedness rule of layout 'x': train longer"
+    )
+    open_ = {**known, "known": False, "source": "handedness rule of layout 'x'; no rule for box"}
+    assert chirality_text(open_).endswith("no rule for box")
+    assert chirality_text({"known": False, "source": "views", "same_side_share": 1.0}) == "UNKNOWN, views"

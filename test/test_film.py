@@ -104,8 +104,10 @@ def test_a_part_of_a_bag(tmp_path, model_file, drawn):
 
 def test_no_keypoints_then(tmp_path, model_file):
     bag = make_bag(tmp_path / "short.mcap", 3)
-    with pytest.raises(BagError, match="no keypoints after 9 s; `paul inspect`"):
+    with pytest.raises(BagError, match="from 9 s on; the bag has keypoints up to 0.1 s: choose an earlier --start"):
         film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif", start=9.0)
+    with pytest.raises(BagError, match="from 0.01 s to 0.02 s; the next are at 0.033 s: choose larger --seconds"):
+        film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif", start=0.01, seconds=0.01)
 
 
 def test_no_keypoints_at_all(tmp_path, model_file, capsys):
@@ -174,6 +176,20 @@ def test_without_a_camera_and_nobody_at_first(tmp_path, drawn):
     assert len(drawn) == 2 and not has(drawn[0][35:400], LEFT) and has(drawn[1], LEFT) > 200
 
 
+def test_the_turntable_shows_whole_persons_and_the_ground(tmp_path, model_file):
+    """Of one that moves fast as well; and all pictures have squares of one size."""
+    from paul_ros.offline.replay import replay
+
+    height = [0, 0, -1.5, -0.5, 0, 0, 3, 0, 0, 0]
+    bag = make_bag(tmp_path / "jump.mcap", 10, rate=10, persons=lambda index: persons_at((0.3, height[index], 6)))
+    stage = film_stage.Stage.of(replay(bag, open_stream(str(model_file))), "jump", 0.0)
+    for index, frame in enumerate(stage.done.frames):
+        points = (frame.lifted.points[frame.lifted.ok] - stage.centres[index]) @ turntable(film_stage._TURN * index).T
+        assert np.abs(points[..., :2]).max() < stage.radii[index]
+        assert 0 < stage.depths[index] < stage.radii[index]
+    assert stage.spacing == film_stage._grid_spacing(np.median(stage.radii))
+
+
 def test_the_turntable():
     np.testing.assert_allclose(turntable(0.3) @ turntable(0.3).T, np.eye(3), atol=1e-12)
     up = turntable(1.0) @ np.array([0, -1.0, 0])
@@ -220,7 +236,7 @@ def test_grid(radius, spacing):
 
 def test_other_formats_are_refused(tmp_path, capsys):
     assert cli.main(["view", "human", "-o", str(tmp_path / "film.avi")]) == 1
-    assert "must end in .gif, .mp4, .png" in capsys.readouterr().err
+    assert "a film is a file that ends in .gif or .mp4 or .png" in capsys.readouterr().err
 
 
 def test_mp4_without_ffmpeg(tmp_path, monkeypatch, capsys):

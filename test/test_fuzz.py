@@ -124,7 +124,7 @@ def test_a_model_that_zip_cannot_unpack_is_refused(bench, tmp_path, place, value
     data[data.index(b"PK\1\2") + place] = value
     path = tmp_path / "odd.npz"
     path.write_bytes(sealed(bytes(data)))
-    with pytest.raises(ModelError, match="is no model file"):
+    with pytest.raises(ModelError, match="is not a model file"):
         load_model(path)
 
 

@@ -252,7 +252,7 @@ def test_all_but_name_names_and_root_may_be_left_out() -> None:
         ("coco", "did you mean 'coco17'"),
         ("Body_25", "did you mean 'body25'"),
         ("excavator", "There are body25, cmu31"),
-        ("nowhere/door.yaml", "nowhere/door.yaml: No such file"),
+        ("nowhere/door.yaml", "nowhere/door.yaml: no such file"),
     ],
 )
 def test_an_unknown_name_is_answered_with_the_known_ones(name: str, advice: str) -> None:
@@ -307,16 +307,17 @@ def test_a_missing_key_is_named(key: str) -> None:
     [
         (b"", "must be a mapping, not NoneType"),
         (b"- a\n- b\n", "must be a mapping, not list"),
-        (b"name: [unclosed", "no YAML"),
-        (b"name: \x80\x81", "no YAML"),
-        (b"a: !!python/object/apply:os.getcwd []", "no YAML"),
-        (b"[" * 5000, "no YAML"),
+        (b"name: [unclosed", "not YAML"),
+        (b"name: \x80\x81", "not YAML"),
+        (b"a: !!python/object/apply:os.getcwd []", "not YAML"),
+        (b"[" * 5000, "not YAML"),
+        (b"name: 2020-99-99", "not YAML"),
         (b"#" * 1_000_001, "1000001 bytes"),
         (b"name: 0x" + b"f" * 5000 + b"\nnames: [a, b, c]\nroot: a", "name must be text.*20000 bits"),
         (b"? 0x" + b"f" * 5000 + b"\n: 1", "unknown key 'a number of 20000 bits'"),
-        (b"name: " + b"9" * 5000, "no YAML"),
+        (b"name: " + b"9" * 5000, "not YAML"),
     ],
-    ids=["empty", "list", "unclosed", "bytes", "python", "nested", "huge", "number", "key", "decimal"],
+    ids=["empty", "list", "unclosed", "bytes", "python", "nested", "date", "huge", "number", "key", "decimal"],
 )
 def test_a_file_that_is_no_layout_is_refused(tmp_path, content: bytes, message: str) -> None:
     path = tmp_path / "broken.yaml"

@@ -84,7 +84,7 @@ def test_a_header_that_is_no_object_is_refused(saved, text):
         archive.comment = b"0" * 64
     body = buffer.getvalue()[:-64]
     saved.write_bytes(body + hashlib.sha256(body).hexdigest().encode())
-    with pytest.raises(ModelError, match="no model file"):
+    with pytest.raises(ModelError, match="not a model file"):
         load_model(saved)
 
 
@@ -215,7 +215,7 @@ def test_enough_is_counted_within_a_category():
 
 def test_other_npz_files_are_distinguished_from_damaged_models(tmp_path):
     np.savez(tmp_path / "data.npz", W=np.zeros((2, 2, 17)))
-    with pytest.raises(ModelError, match="no model file"):
+    with pytest.raises(ModelError, match="not a model file"):
         load_model(tmp_path / "data.npz")
 
 

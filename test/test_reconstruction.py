@@ -163,14 +163,14 @@ def test_a_saved_reconstruction_is_read_again(tmp_path):
 
 
 NO_RECONSTRUCTION = {
-    "nothing": (None, "is not there"),
+    "nothing": (None, "x.npz: no such file"),
     "data": (dict(W=np.zeros((4, 2, 5))), "has no array shapes; it has .*W"),
     "much else": ({f"a{i}": 0 for i in range(9)}, "it has rotations, used, loss, seconds, a0 and 8 more"),
     "2D": (dict(shapes=np.zeros((4, 2, 5))), r"not \(F,3,P\)"),
     "pickled": (dict(shapes=np.array([{}])), "plain arrays with np.savez"),
     "frames of others": (dict(shapes=np.zeros((4, 3, 5)), used=np.arange(6) < 3), "which frames its 4 are"),
     "frames by number": (dict(shapes=np.zeros((4, 3, 5)), used=np.arange(4)), "which frames its 4 are"),
-    "a loss in words": (dict(shapes=np.zeros((4, 3, 5)), loss="low"), "no numbers"),
+    "a loss in words": (dict(shapes=np.zeros((4, 3, 5)), loss="low"), "not a saved reconstruction: .*not numbers"),
 }
 
 
@@ -183,7 +183,7 @@ def test_files_without_a_reconstruction_are_refused(tmp_path, case):
             path,
             **{"rotations": np.zeros((4, 3, 3)), "used": np.ones(4, bool), "loss": 0.0, "seconds": 0.0, **contents},
         )
-    with pytest.raises(DataError, match=f"no saved reconstruction: .*{message}") as caught:
+    with pytest.raises(DataError, match=message) as caught:
         load_reconstruction(path)
     assert "allow_pickle" not in str(caught.value)
 
@@ -249,7 +249,7 @@ def test_a_gpu_that_is_not_there_is_named(file, tmp_path, monkeypatch):
 
 def test_tensorboard_is_asked_for_before_the_first_step(file, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboard", None)
-    with pytest.raises(MissingPackageError, match=r"paul_ros\[tensorboard\]"):
+    with pytest.raises(MissingPackageError, match=r"\.\[tensorboard\]"):
         train(file, "-o", tmp_path / "m.npz", *AS_OPTIONS, "--tensorboard")
     assert not list((tmp_path / "m.run").glob("*"))
 

@@ -9,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from tiny_data import sequence
 
 from paul_ros.model_file import load_model, save_model
+from training.errors import DataError
+from training.options import TrainingOptions
 from training.recipe import Recipe
-from training.sources import is_motion_capture
+from training.sources import is_motion_capture, loader_of
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / "bags" / "one_person.mcap"
@@ -36,6 +39,12 @@ def test_motion_capture_is_a_folder_of_its_files_that_is_no_bag(tmp_path):
     for paths in ([tmp_path / "a.npz"], [BAG], [bag], [tmp_path / "empty"], [capture, capture]):
         assert not is_motion_capture(paths), paths
     assert is_motion_capture([capture])
+
+
+def test_a_folder_without_data_is_explained(tmp_path):
+    options = TrainingOptions(data=(tmp_path,), model=tmp_path / "m.npz", recipe="default")
+    with pytest.raises(DataError, match="no .mcap file in this folder, and no motion capture"):
+        loader_of(options)(options, Recipe(), torch.device("cpu"))
 
 
 TRAIN = """

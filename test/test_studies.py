@@ -17,6 +17,7 @@ from paul_ros.layout import anonymous_layout
 from paul_ros.model_file import load_model, save_model, weight_shapes
 from training import reconstruction
 from training.categories import joint_layout
+from training.errors import DataError
 from training.judge.studies import interpolation, registry
 from training.judge.studies.latent import roughness
 from training.judge.truth import random_rotations
@@ -160,6 +161,10 @@ def test_interpolation_draws_the_line_between_two_codes(model_file, tmp_path, ca
     size = line["ends_apart_percent"] / 100
     assert sum(line["changes_percent"]) / 100 >= size > 0
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(size * np.linalg.norm(ends, axis=(1, 2)).mean(), rel=0.1)
+    with pytest.raises(
+        DataError, match="43 points, but model '.*' has 17: give the model of these points with --model"
+    ):
+        interpolation.run(str(model_file), [Path(file[0])], tmp_path, None)
     (other,) = study("interpolation", file, tmp_path, "--model", "human")["rows"]
     codes = model.encode(S[:, :2], np.ones((10, 43), bool))
     apart = np.linalg.norm(codes[:, None] - codes, axis=2)

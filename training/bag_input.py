@@ -27,6 +27,7 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
     camera, image_size, rejections = _bag_camera(path)
     frames = _bag_keypoints(path, layout, topic, image_size, rejections)
     if not frames:
+        _check_topic(path, topic)
         raise DataError(
             f"'{path}' holds no 2D keypoints of layout '{layout.name}'{f' on topic {topic}' if topic else ''}"
             f"{_reasons(rejections)}; name the right layout with --layout"
@@ -40,6 +41,17 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
         return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False)
     some = visible.any(1)
     return RawFrames(centred_view(xy[some], visible[some], camera).W, visible[some], layout, calibrated=True)
+
+
+def _check_topic(path: Path, topic: str | None) -> None:
+    """Raise DataError if a bag has no messages of 2D keypoints on a topic."""
+    from paul_ros.offline.bag_reader import matches, topics_of
+
+    topics = {name: kind for name, (kind, _) in topics_of(path).items()}
+    if not topic or any(matches(name, topic) and kind in msg_adapters.SUPPORTED for name, kind in topics.items()):
+        return
+    held = ", ".join(f"{name} ({kind})" for name, kind in topics.items())
+    raise DataError(f"'{path}' has no 2D keypoints on {topic}; the bag holds {held or 'none at all'}. Choose --topic")
 
 
 def _bag_keypoints(

@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from paul_ros.layout import Layout
+
+CLEAR_SHARE = 0.95
+"""Share of shapes on the right side of the handedness rules above which the chirality is known."""
 
 
 def rule_share(shapes: np.ndarray, layout: Layout) -> float | None:
@@ -22,6 +27,16 @@ def rule_share(shapes: np.ndarray, layout: Layout) -> float | None:
         ]
         keeps &= np.linalg.det(np.stack(axes, axis=1)) > 0
     return float(keeps.mean())
+
+
+def chirality_text(chirality: dict[str, Any]) -> str:
+    """Return the header's ``chirality`` in words, and why it is unknown."""
+    if chirality["known"]:
+        return f"known, {chirality['source']}"
+    share = chirality.get("training_share", 1.0)
+    if share >= CLEAR_SHARE:
+        return f"UNKNOWN, {chirality['source']}"
+    return f"UNKNOWN, only {100 * share:.0f} % of the frames obey the {chirality['source']}: train longer"
 
 
 def same_side_share(shapes: np.ndarray, mean: np.ndarray) -> float:

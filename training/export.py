@@ -14,7 +14,7 @@ import paul_ros
 from paul_ros.layout import Layout
 from paul_ros.metrics import procrustes
 from paul_ros.model_file import save_model
-from training.chirality import rule_share, same_side_share
+from training.chirality import CLEAR_SHARE, rule_share, same_side_share
 from training.data import TrainingData
 from training.networks import Paul
 from training.objective import fit
@@ -27,8 +27,6 @@ _SHAPES, _COORDINATES = 4096, 2**24
 
 _BATCH = 1024
 _MEAN_ROUNDS = 10
-_CLEAR = 0.95
-"""Share of shapes on the right side of the handedness rules above which the chirality is known."""
 
 
 def export_model(trainer: Trainer, loss: float, path: Path, command: str) -> dict:
@@ -137,7 +135,7 @@ def _chirality(shapes: np.ndarray, mean: np.ndarray, layout: Layout, weight: flo
     open_ = [name for name, points in layout.categories.items() if ruled.isdisjoint(points)]
     source = f"handedness rule of layout '{layout.name}', training weight {weight:g}"
     return {
-        "known": share >= _CLEAR and not open_,
+        "known": share >= CLEAR_SHARE and not open_,
         "source": f"{source}; no rule for {', '.join(open_)}" if open_ else source,
         "training_share": round(share, 4),
     }

@@ -41,7 +41,7 @@ def load_training_data(
     """
     path = Path(path)
     if not path.exists():
-        raise DataError(f"no data at '{path}'")
+        raise DataError(f"{path}: no such file or folder")
     if path.suffix == ".npz":
         return checked(read_arrays(path, layout), path, guessed=layout is None)
     layout = layout or load_layout(DEFAULT_LAYOUT)

@@ -15,6 +15,7 @@ import yaml
 
 from paul_ros.layout import Layout
 from paul_ros.viewing_goal import Scale
+from paul_ros.wording import did_you_mean
 from training.errors import RecipeError
 
 CHOICES = {
@@ -195,9 +196,11 @@ class Recipe:
             a, b, metres = length if isinstance(length, tuple) and len(length) == 3 else (None, None, None)
             between = a in layout.names and b in layout.names and a != b
             if not between or type(metres) not in (int, float) or not 1e-3 <= metres < 1e3:
+                unknown = [f"'{name}'" for name in (a, b) if isinstance(name, str) and name not in layout.names]
+                why = f"; the layout has no {' and no '.join(unknown)}" if unknown else ""
                 raise RecipeError(
                     f"known_lengths must be [point, point, metres] with two points of layout '{layout.name}', "
-                    f"one is {length!r}"
+                    f"one is {length!r}{why}"
                 )
 
     def to_dict(self) -> dict[str, Any]:
@@ -218,7 +221,8 @@ def _read(name_or_path: str | Path) -> dict[str, Any]:
     text = str(name_or_path)
     path = resources.files("training") / "recipes" / f"{text}.yaml" if text in recipe_names() else Path(text)
     if not path.is_file():
-        raise RecipeError(f"no recipe '{text}': neither a file nor one of {', '.join(recipe_names())}")
+        hint = did_you_mean(text, recipe_names()) or "."
+        raise RecipeError(f"no recipe '{text}'{hint} It is neither a file nor one of {', '.join(recipe_names())}")
     settings = _parsed(path.read_bytes(), f"recipe '{text}'") or {}
     if not isinstance(settings, dict):
         raise RecipeError(f"recipe '{text}' must be settings as key: value")
@@ -234,7 +238,7 @@ def _parsed(text: str | bytes, source: str) -> Any:
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise RecipeError(f"{source} is no YAML: {' '.join(str(error).split())[:200]}") from None
+        raise RecipeError(f"{source} is not YAML: {' '.join(str(error).split())[:200]}") from None
 
 
 def _mapping(value: object, key: str) -> dict[str, Any]:

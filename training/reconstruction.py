@@ -69,19 +69,23 @@ def load_reconstruction(path: str | Path) -> Reconstruction:
     Raises:
         DataError: there is no such file, or it holds something else.
     """
+    if not Path(path).exists():
+        raise DataError(f"{path}: no such file")
     try:
         arrays = read_npz(path, ("shapes", "rotations", "used", "loss", "seconds"), ("codes",))
     except NpzError as error:
-        raise DataError(f"'{path}' is no saved reconstruction: it {error}") from error
+        raise DataError(f"'{path}' is not a saved reconstruction: it {error}") from error
     used, shapes, rotations = arrays["used"], arrays["shapes"], arrays["rotations"]
     if shapes.ndim != 3 or shapes.shape[1] != 3 or rotations.shape != (len(shapes), 3, 3):
-        raise DataError(f"'{path}' is no saved reconstruction: shapes are {shapes.shape}, not (F,3,P)")
+        raise DataError(f"'{path}' is not a saved reconstruction: shapes are {shapes.shape}, not (F,3,P)")
     if used.dtype != bool or used.ndim != 1 or used.sum() != len(shapes):
-        raise DataError(f"'{path}' is no saved reconstruction: used does not show which frames its {len(shapes)} are")
+        raise DataError(
+            f"'{path}' is not a saved reconstruction: used does not show which frames its {len(shapes)} are"
+        )
     try:
         loss, seconds = float(arrays["loss"]), float(arrays["seconds"])
     except (TypeError, ValueError) as error:
-        raise DataError(f"'{path}' is no saved reconstruction: loss and seconds are no numbers") from error
+        raise DataError(f"'{path}' is not a saved reconstruction: loss and seconds are not numbers") from error
     return Reconstruction(used, shapes, rotations, arrays.get("codes"), loss, seconds)
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from training.chirality import chirality_text
 from training.data import TrainingData
 from training.data_checks import check_sizes
 from training.distributed import is_first, joined
@@ -190,7 +191,7 @@ def _result_lines(runs: list[FinishedRun], header: dict[str, Any], options: Trai
             f"{_loss_text(runs[0])}"
         )
         yield f"  scale: {f'{metres:.4f} m per model unit' if metres else 'unknown (no known_lengths in the recipe)'}"
-        yield f"  chirality: {'known' if chirality['known'] else 'UNKNOWN'}, {chirality['source']}"
+        yield f"  chirality: {chirality_text(chirality)}"
 
 
 def _loss_text(run: FinishedRun) -> str:

@@ -12,6 +12,7 @@ import torch
 from paul_ros.layout import load_layout
 from training.categories import load_files
 from training.data import TrainingData
+from training.errors import DataError
 from training.options import TrainingOptions
 from training.preflight import check_recipe
 from training.recipe import Recipe
@@ -52,10 +53,21 @@ def load_keypoints(options: TrainingOptions, recipe: Recipe, device: torch.devic
     """Load npz files and bags in every process; see ``Loader``.
 
     Raises:
-        DataError, BagError, LayoutError: see ``load_files``.
+        DataError, BagError, LayoutError: see ``load_files``; or a folder holds no data.
         RecipeError, ModelError: see ``check_recipe``.
     """
+    for path in options.data:
+        _check_folder(Path(path))
     layout = load_layout(options.layout) if options.layout else None
     data = load_files(options.data, layout, options.topic, options.min_confidence)
     check_recipe(options, recipe, data.layout)
     return data, replace(recipe, views=None)
+
+
+def _check_folder(path: Path) -> None:
+    """Raise DataError if the path is a folder that is no bag."""
+    if path.is_dir() and not (path / "metadata.yaml").exists() and not any(path.glob("*.mcap")):
+        raise DataError(
+            f"{path}: no .mcap file in this folder, and no motion capture (.asf with .amc, .bvh, .npz); convert other "
+            "bags with `ros2 bag convert`"
+        )

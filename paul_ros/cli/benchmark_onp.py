@@ -28,8 +28,9 @@ columns, a line for each scenario and method:
   µs batch: time of a pose in one call with --batch of them
   x lsq:    µs batch over that of lsq_svd
 
-"More" and "less" mean by 1e-9 of the image's mean square, in means of squared distances. Noise is the
-standard deviation of each image coordinate over the shape's rms radius / sqrt(3), both in the image's unit.
+Residuals are mean squared distances; differences below 1e-9 of the image's mean square count as equal.
+Noise is the standard deviation of each image coordinate over the shape's rms radius / sqrt(3), both in the
+unit of the image.
 
 methods:
   ours:      paul_ros.onp

@@ -47,7 +47,12 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("model", metavar="MODEL", help="model file or shipped model; with --truth saved shapes (.npz)")
     parser.add_argument("data", metavar="DATA", type=Path, nargs="?", help="npz with W and the truth S, see below")
-    parser.add_argument("--truth", metavar="DATA", type=Path, help="npz that judges MODEL, which then holds shapes")
+    parser.add_argument(
+        "--truth",
+        metavar="DATA",
+        type=Path,
+        help="npz with the truth S; MODEL is then a file of shapes that `paul train --shapes` wrote",
+    )
     add_json(parser)
     add_plot(parser, "frames over their truth, and all errors")
     parser.set_defaults(run=run, usage_error=parser.error)

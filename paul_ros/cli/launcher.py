@@ -12,6 +12,7 @@ from collections.abc import Collection
 
 from paul_ros import __version__
 from paul_ros.cli.options import HelpFormatter
+from paul_ros.cli.parser import Parser
 
 COMMANDS = {
     "lift": "lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
@@ -65,7 +66,6 @@ def _run(argv: list[str]) -> int:
         _use_one_thread()
     try:
         parser = build_parser(argv)
-        _check_command(parser, argv)
         args = parser.parse_args(argv)
         args.run(args)
     except KeyboardInterrupt as stop:
@@ -76,7 +76,7 @@ def _run(argv: list[str]) -> int:
     except Exception as error:
         if not _is_expected(error):
             raise
-        print(f"paul: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"paul: {' '.join(_text(error).split())}", file=sys.stderr)
         return 1
     return 0
 
@@ -88,7 +88,7 @@ def build_parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.Argument
         wanted: words that include the commands to be parsed. The others get no arguments, and their modules are not
             imported, which saves time.
     """
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="paul",
         description="Lift the 2D keypoints of any object to 3D, with a model that is learned from 2D alone.",
         epilog=_EPILOG,
@@ -104,18 +104,6 @@ def build_parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.Argument
     return parser
 
 
-def _check_command(parser: argparse.ArgumentParser, argv: list[str]) -> None:
-    """Exit with the nearest command, if the first word is none; argparse suggests one from Python 3.14 on."""
-    word = argv[0] if argv else ""
-    if not word or word.startswith("-") or word in COMMANDS:
-        return
-    import difflib
-
-    close = difflib.get_close_matches(word.lower(), list(COMMANDS), n=1)
-    hint = f", did you mean '{close[0]}'?" if close else "."
-    parser.error(f"no command '{word}'{hint} The commands are {', '.join(COMMANDS)}")
-
-
 def _use_one_thread() -> None:
     """Limit BLAS to one thread, as the node does, before NumPy starts.
 
@@ -123,6 +111,13 @@ def _use_one_thread() -> None:
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
+
+
+def _text(error: Exception) -> str:
+    """Return an error's text; that of a file begins with its name, as the package's own errors do."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 def _is_expected(error: Exception) -> bool:

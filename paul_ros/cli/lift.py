@@ -15,6 +15,7 @@ from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_
 from paul_ros.cli.output import STDOUT, check_files, open_output
 from paul_ros.cli.progress import progress
 from paul_ros.stream.parameters import DEFAULTS
+from paul_ros.wording import quantity
 
 if TYPE_CHECKING:
     from msg_adapters import Intrinsics
@@ -176,7 +177,7 @@ def _summary(args: argparse.Namespace, tally: Counter[str], layout: str, units: 
     reasons = _reasons(tally)
     output = "standard output" if args.output == STDOUT else args.output
     return (
-        f"{output}: {tally[_LIFTED]} of {persons} persons lifted, layout {layout}, "
+        f"{output}: {tally[_LIFTED]} of {quantity(persons, 'person')} lifted, layout {layout}, "
         f"units {units}{f'; not lifted: {reasons}' if reasons else ''}"
     )
 
@@ -189,7 +190,7 @@ def _reasons(tally: Counter[str]) -> str:
 def _notes(tally: Counter[str], camera: Intrinsics | None, layout: str) -> list[str]:
     notes = []
     if camera is None:
-        notes.append("note: no camera, so lengths are in model units; name --camera or --intrinsics for metres")
+        notes.append("note: no camera, so lengths are in model units; give --camera or --intrinsics for metres")
     elif camera.distorted:
         notes.append(
             "note: the camera has distortion but no P, so K is used: positions are a little wrong unless the keypoints "
@@ -225,7 +226,11 @@ def _camera(args: argparse.Namespace) -> Intrinsics | None:
 @contextlib.contextmanager
 def _open_input(path: Path) -> Iterator[BinaryIO]:
     """Open a file, or standard input, which stays open."""
+    from paul_ros.errors import KeypointFileError
+
     if path != STDOUT:
+        if not path.exists():
+            raise KeypointFileError(f"{path}: no such file")
         with path.open("rb") as file:
             yield file
     elif sys.stdin is None:

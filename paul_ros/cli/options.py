@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 else:
     Commands = argparse._SubParsersAction
 
-_PICTURES = (".png", ".svg", ".pdf")
+PICTURES = (".png", ".svg", ".pdf")
+"""Suffixes of a picture."""
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -172,7 +173,9 @@ def minutes(text: str) -> float:
 def picture_path(text: str) -> Path:
     """Parse the path of a picture."""
     path = Path(text)
-    if path.suffix not in _PICTURES:
+    if text == "-":
+        raise argparse.ArgumentTypeError("a picture cannot go to standard output: name a file, as in FILE.png")
+    if path.suffix not in PICTURES:
         raise argparse.ArgumentTypeError(f"'{text}' ends neither in .png nor in .svg or .pdf")
     return path
 

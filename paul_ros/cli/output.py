@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,6 +22,19 @@ def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | No
     from paul_ros.output_files import check_outputs
 
     check_outputs([path for path in outputs if path != STDOUT], inputs)
+
+
+def check_suffix(path: Path | None, suffixes: Collection[str]) -> None:
+    """Refuse a file, if there is one, whose name does not say its format.
+
+    Raises:
+        OutputError: names the suffixes.
+    """
+    from paul_ros.errors import OutputError
+
+    if path and path.suffix not in suffixes:
+        what = "this cannot go to standard output" if path == STDOUT else f"{path}: this suffix says no format"
+        raise OutputError(f"{what}; name a file that ends in {' or '.join(suffixes)}")
 
 
 def publish(

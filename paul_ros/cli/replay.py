@@ -7,6 +7,7 @@ import argparse
 from pathlib import Path
 
 from paul_ros.cli.options import (
+    PICTURES,
     Commands,
     HelpFormatter,
     add_json,
@@ -15,7 +16,7 @@ from paul_ros.cli.options import (
     add_person_height,
     add_topics,
 )
-from paul_ros.cli.output import STDOUT, check_files, publish
+from paul_ros.cli.output import STDOUT, check_files, check_suffix, publish
 from paul_ros.cli.progress import progress
 
 _DESCRIPTION = """\
@@ -95,6 +96,8 @@ def run(args: argparse.Namespace) -> None:
     from paul_ros.stream.stream import open_stream
 
     check_files([args.output, args.json, args.plot], [args.bag, args.model, args.layout, args.output_layout])
+    check_suffix(args.output, [".mcap"])
+    check_suffix(args.plot, PICTURES)
     if args.json != STDOUT:
         require("bags", "rich")
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
@@ -104,6 +107,9 @@ def run(args: argparse.Namespace) -> None:
         done = replay(args.bag, stream, args.output, topics, lambda: count(1))
     report = evaluate(done)
     publish(report, table, args.json, (lambda: write_picture(args.plot, done)) if args.plot else None)
+    written = [str(path) for path in (args.output, args.json, args.plot) if path]
+    if written and args.json != STDOUT:
+        print(f"written: {', '.join(written)}")
     if not report["lifted"] and done.drop_advice:
         raise BagError(f"{args.bag}: nobody could be lifted: {' '.join(done.drop_advice)}")
     if done.damage:

@@ -22,7 +22,7 @@ _INTERPOLATION = "shapes on the line between two codes of a model"
 _WITHOUT_VALUES = ("auto_decoder", "latent")
 _EPILOG = """\
 FILE is an npz with W and the truth S, as for `paul evaluate`. The trainer gets W and visible only, with
-the frames shuffled. The study `interpolation` needs no S. The folder receives NAME.png and NAME.json.
+the frames shuffled. The study `interpolation` needs no S. The folder receives STUDY.png and STUDY.json.
 Its subfolder work/ keeps the runs, so that the same command continues an interrupted study.
 
 examples:
@@ -43,7 +43,7 @@ def add_parser(commands: Commands) -> None:
         epilog=_EPILOG,
         formatter_class=HelpFormatter,
     )
-    studies = parser.add_subparsers(metavar="NAME", required=True)
+    studies = parser.add_subparsers(metavar="STUDY", required=True)
     for name, question in STUDIES.items():
         study = _add_study(studies, name, question)
         if name not in _WITHOUT_VALUES:

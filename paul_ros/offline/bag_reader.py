@@ -69,7 +69,7 @@ def topics_of(path: str | Path) -> dict[str, tuple[str, int]]:
 def _files(path: Path) -> list[Path]:
     """Return the mcap files of a bag in recording order."""
     if not path.exists():
-        raise BagError(f"{path}: no such bag")
+        raise BagError(f"{path}: no such file or folder")
     if path.is_file():
         return [path]
     files = _files_in_metadata(path / "metadata.yaml") if (path / "metadata.yaml").exists() else []
@@ -83,7 +83,7 @@ def _files_in_metadata(metadata: Path) -> list[Path]:
     try:
         names = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
         files = [metadata.parent / Path(name).name for name in names]
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
+    except (yaml.YAMLError, ValueError, RecursionError, KeyError, TypeError):
         return []  # a killed recorder leaves no metadata, or half of it; then the files themselves are listed
     return [file for file in files if file.suffix == ".mcap" and file.exists()]
 

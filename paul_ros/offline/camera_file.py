@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from msg_adapters import Intrinsics, MessageError, read_camera_info
+from msg_adapters.camera_info import FOCAL_PIXELS
 from paul_ros.errors import ParameterError
 
 _MAX_BYTES = 1_000_000
@@ -52,7 +53,14 @@ def camera_of(fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
     try:
         return _intrinsics([fx, 0, cx, 0, fy, cy, 0, 0, 1], [], [], 0, 0)
     except MessageError as error:
-        raise ParameterError(f"--intrinsics: {error}") from error
+        shortest, longest = FOCAL_PIXELS
+        for name, focal_length in (("fx", fx), ("fy", fy)):
+            if not shortest <= focal_length <= longest:
+                cure = f"{name} is {focal_length:g}; give a focal length of {shortest:g} to {longest:g} pixels"
+                break
+        else:
+            cure = f"cx is {cx:g} and cy {cy:g}; give a principal point within {longest:g} pixels"
+        raise ParameterError(f"--intrinsics: {cure}") from error
 
 
 def _intrinsics(k: Sequence[float], p: Sequence[float], d: Sequence[float], width: int, height: int) -> Intrinsics:
@@ -65,6 +73,8 @@ def _read(path: Path) -> dict[Any, Any]:
         if path.stat().st_size > _MAX_BYTES:
             raise ParameterError(f"camera file {path} has more than {_MAX_BYTES} bytes: {_CURE}")
         data = yaml.safe_load(path.read_bytes())
+    except FileNotFoundError:
+        raise ParameterError(f"camera file {path}: no such file") from None
     except OSError as error:
         raise ParameterError(f"camera file {path}: {error.strerror or error}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date such as 2020-99-99 is a ValueError

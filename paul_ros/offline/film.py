@@ -63,15 +63,11 @@ def view_bag(
         The film, and the error of a damaged bag, which is drawn up to the damage.
 
     Raises:
-        BagError: no keypoints can be read in that part.
+        BagError: no keypoints can be read in that part; says up to when the bag has some.
         PictureError: nobody was lifted, or the film cannot be written.
     """
     check_format(out)
     excerpt = Excerpt.choose(bag, topics, start, seconds)
-    if excerpt is None:
-        replay(bag, stream, topics=topics)  # explains a bag that has no keypoints at all
-        when = f"after {start:g} s" if seconds is None else f"from {start:g} s to {start + seconds:g} s"
-        raise BagError(f"{bag}: no keypoints {when}; `paul inspect` shows how long the bag is")
     with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / "part.mcap"
         excerpt.copy(bag, part, topics)

@@ -14,7 +14,8 @@ from paul_ros.offline.bag_reader import matches, read_records
 from paul_ros.offline.bag_records import Record
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.film_files import PICTURES_PER_SECOND
-from paul_ros.offline.replay import Topics
+from paul_ros.offline.replay import Topics, no_keypoints
+from paul_ros.wording import quantity
 
 #: Most pictures of a film; a longer bag is shown in larger steps.
 MAX_PICTURES = 200
@@ -46,7 +47,7 @@ class Excerpt:
     damage: BagError | None
 
     @classmethod
-    def choose(cls, bag: Path, topics: Topics, start: float, seconds: float | None) -> Excerpt | None:
+    def choose(cls, bag: Path, topics: Topics, start: float, seconds: float | None) -> Excerpt:
         """Choose up to MAX_PICTURES images.
 
         Args:
@@ -55,17 +56,16 @@ class Excerpt:
             start: seconds from the bag's first keypoints.
             seconds: length of the part; None = to the end.
 
-        Returns:
-            None if there are no keypoints in that part.
-
         Raises:
-            BagError: not one keypoint message can be read.
+            BagError: the bag has no keypoint messages that can be read, or none in that part.
         """
         times, one_person, damage = _keypoint_times(bag, topics)
         since = (times - times[:1]) / 1e9
         wanted = np.flatnonzero((since >= start) & (since <= start + (np.inf if seconds is None else seconds)))
+        if not len(times):
+            raise BagError(no_keypoints(bag, topics))
         if not len(wanted):
-            return None
+            raise BagError(_empty_part(bag, since, start, seconds))
         first, last = since[wanted[0]], since[wanted[-1]]
         step = max(1 / PICTURES_PER_SECOND, (last - first) / (MAX_PICTURES - 1))
         # Rounded, so that a camera's jitter makes no step a frame longer.
@@ -97,8 +97,8 @@ class Excerpt:
         """Return one line about what a film of so many pictures shows and leaves out."""
         speed = "in real time" if self.speed < 1.01 else f"{self.speed:.1f} times as fast as real time"
         return (
-            f"{pictures} pictures of {self.messages} messages, {self.first:.1f} to {self.last:.1f} s "
-            f"of {self.length:.1f} s, {speed}"
+            f"{quantity(pictures, 'picture')} of {quantity(self.messages, 'message')}, "
+            f"{self.first:.1f} to {self.last:.1f} s of {self.length:.1f} s, {speed}"
         )
 
 
@@ -115,6 +115,16 @@ def _keypoint_times(bag: Path, topics: Topics) -> tuple[np.ndarray, bool, BagErr
             raise
         return np.array(times, int), one_person, error
     return np.array(times, int), one_person, None
+
+
+def _empty_part(bag: Path, since: np.ndarray, start: float, seconds: float | None) -> str:
+    """Return the error for a part without keypoints; `since` is the seconds from the first keypoints to each."""
+    when = f"from {start:g} s on" if seconds is None else f"from {start:g} s to {start + seconds:g} s"
+    if start > since[-1]:
+        cure = f"the bag has keypoints up to {since[-1]:.1f} s: choose an earlier --start"
+    else:
+        cure = f"the next are at {since[since >= start][0]:.3f} s: choose larger --seconds"
+    return f"{bag}: no keypoints {when}; {cure}"
 
 
 def _with_same_image(times: np.ndarray, chosen: np.ndarray) -> np.ndarray:

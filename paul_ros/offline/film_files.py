@@ -32,7 +32,7 @@ def check_format(path: Path) -> None:
         PictureError: the suffix is unknown, or ffmpeg is missing.
     """
     if path.suffix not in SUFFIXES:
-        raise PictureError(f"{path}: the name must end in {', '.join(SUFFIXES)}")
+        raise PictureError(f"{path}: a film is a file that ends in {' or '.join(SUFFIXES)}")
     if path.suffix == ".mp4" and not shutil.which("ffmpeg"):
         raise PictureError(f"{path}: mp4 needs the program ffmpeg, which is missing; choose a name ending in .gif")
 

@@ -18,11 +18,12 @@ from paul_ros.offline.canvas import AMBER, CALM, CAPTION, INK, Canvas, draw_lege
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.skeleton_drawing import draw_skeleton
 from paul_ros.stream.messages import project
+from paul_ros.wording import quantity
 
 _TURN = np.radians(3.0)  # of the turntable, a picture
 _FOLLOW_PICTURES = 15  # over which the turntable follows the persons
 _GRID_LINES = 4  # to either side of the middle
-_GRID_COLOUR = "#e6e6e6"
+_GRID_COLOUR, _FLOOR_COLOUR = "#e6e6e6", "#cfd4d9"
 _REPROJECTION_COLOUR = "#bbbbbb"
 
 
@@ -35,8 +36,9 @@ class Stage:
         name: title of the film.
         first: seconds of the bag at the first picture.
         centres: (F,3) point that the turntable turns about, units of the points.
-        radii: (F,) distance around it that the turntable shows.
-        floor: y of the ground, which is the lowest point.
+        radii: (F,) distance around it that the turntable shows: the whole persons, and the ground below them.
+        depths: (F,) the ground below the centre, units of the points. The ground is the lowest point of the film.
+        spacing: side of a square on the ground, units of the points.
         room: (2,2) least and largest x and z in metres, seen from above; None in model units, which have no place.
         image: (2,2) least and largest pixels.
         canvas: where it is drawn.
@@ -47,7 +49,8 @@ class Stage:
     first: float
     centres: np.ndarray
     radii: np.ndarray
-    floor: float
+    depths: np.ndarray
+    spacing: float
     room: np.ndarray | None
     image: np.ndarray
     canvas: Canvas
@@ -58,17 +61,24 @@ class Stage:
         bodies = [frame.lifted.points[frame.lifted.ok] for frame in done.frames]
         centres = _smooth([points.mean((0, 1)) if len(points) else None for points in bodies])
         around = [points - centre for points, centre in zip(bodies, centres)]
-        reach = [np.linalg.norm(points, axis=2).max() * np.ones(1) if len(points) else None for points in around]
         # Frames without persons may have the points of another layout: the bag's layout shows with the first person.
         everywhere, centred = (np.concatenate([body.reshape(-1, 3) for body in which]) for which in (bodies, around))
         metric = done.stream.units == "m"
+        floor = np.percentile((everywhere if metric else centred)[:, 1], 98)
+        depths = floor - (centres[:, 1] if metric else np.zeros(len(centres)))
+        reach = [
+            np.array([max(np.linalg.norm(points, axis=2).max(), depth)]) if len(points) else None
+            for points, depth in zip(around, depths)
+        ]
+        radii = 1.05 * _smooth_above(reach)[:, 0]
         return cls(
             done,
             name,
             first,
             centres,
-            1.05 * _smooth(reach)[:, 0],
-            float(np.percentile(everywhere[:, 1] if metric else centred[:, 1], 98)),
+            radii,
+            depths,
+            _grid_spacing(float(np.median(radii))),
             _room(everywhere) if metric else None,
             _image(done),
             Canvas(),
@@ -91,7 +101,7 @@ class Stage:
         ok = frame.lifted.ok
         doubtful = bool((ok & (frame.lifted.ambiguity >= AMBIGUOUS)).any())
         seconds = self.first + (frame.stamp - self.done.frames[0].stamp) / 1e9
-        persons = f"{len(ok)} person{'' if len(ok) == 1 else 's'}"
+        persons = quantity(len(ok), "person")
         persons += f", {int((~ok).sum())} not lifted" if not ok.all() else ""
         model = self.done.stream.lifter.model.name
         self.canvas.title(
@@ -131,10 +141,8 @@ class Stage:
         units = "metres" if self.room is not None else "model units"
         turn = turntable(_TURN * index)
         centre, radius = self.centres[index], self.radii[index]
-        spacing = _grid_spacing(radius)
-        floor = np.array([0.0, self.floor - (centre[1] if self.room is not None else 0.0), 0.0])
-        _draw_floor(ax, turn, floor, spacing)
-        ax.set_title(f"turntable, {units}; a square is {spacing:g}", **CAPTION)
+        _draw_floor(ax, turn, np.array([0.0, self.depths[index], 0.0]), self.spacing)
+        ax.set_title(f"turntable, {units}; a square is {self.spacing:g}", **CAPTION)
         for person in np.flatnonzero(frame.lifted.ok):
             points = (frame.lifted.points[person] - centre) @ turn.T
             self._draw_person(ax, frame, int(person), points[:, :2], points[:, 2], 1.3)
@@ -161,12 +169,26 @@ class Stage:
 
 def _smooth(values: Sequence[np.ndarray | None]) -> np.ndarray:
     """Return values (F,D), one per frame, averaged over time; frames without a value are interpolated."""
+    return _windows(_filled(values)).mean(1)
+
+
+def _smooth_above(values: Sequence[np.ndarray | None]) -> np.ndarray:
+    """Return smooth values (F,D) that are nowhere below the given ones."""
+    return _windows(_windows(_filled(values)).max(1)).mean(1)
+
+
+def _filled(values: Sequence[np.ndarray | None]) -> np.ndarray:
+    """Return values (F,D), one per frame; frames without a value are interpolated."""
     known = {index: value for index, value in enumerate(values) if value is not None}
     frames = np.arange(len(values))
-    filled = np.stack([np.interp(frames, list(known), column) for column in np.array(list(known.values())).T], axis=1)
+    return np.stack([np.interp(frames, list(known), column) for column in np.array(list(known.values())).T], axis=1)
+
+
+def _windows(values: np.ndarray) -> np.ndarray:
+    """Return the _FOLLOW_PICTURES values around each frame, (F,_FOLLOW_PICTURES,D) of (F,D); the ends repeat."""
     half = _FOLLOW_PICTURES // 2
-    padded = np.concatenate([filled[:1].repeat(half, 0), filled, filled[-1:].repeat(half, 0)])
-    return np.stack([padded[index : index + _FOLLOW_PICTURES].mean(0) for index in frames])
+    padded = np.concatenate([values[:1].repeat(half, 0), values, values[-1:].repeat(half, 0)])
+    return np.stack([padded[index : index + _FOLLOW_PICTURES] for index in range(len(values))])
 
 
 def _room(points: np.ndarray) -> np.ndarray:
@@ -202,4 +224,4 @@ def _draw_floor(ax: Any, turn: np.ndarray, middle: np.ndarray, spacing: float) -
     ends = spacing * _GRID_LINES
     for at in spacing * np.arange(-_GRID_LINES, _GRID_LINES + 1):
         for line in ([[at, 0, -ends], [at, 0, ends]], [[-ends, 0, at], [ends, 0, at]]):
-            ax.plot(*((np.array(line) + middle) @ turn.T)[:, :2].T, color="#e2e5e8", linewidth=0.8, zorder=0)
+            ax.plot(*((np.array(line) + middle) @ turn.T)[:, :2].T, color=_FLOOR_COLOUR, linewidth=0.8, zorder=0)

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from paul_ros.errors import BagError
+from paul_ros.errors import BagError, InputError
 from paul_ros.layout import Layout, layout_names, load_layout
 from paul_ros.model_file import load_model, model_names
 from paul_ros.offline.bag_reader import read_records
+from paul_ros.wording import nearest
 
 
 def inspect(thing: str) -> tuple[dict, BagError | None]:
@@ -23,6 +24,7 @@ def inspect(thing: str) -> tuple[dict, BagError | None]:
 
     Raises:
         BagError, LayoutError, ModelError: it cannot be read.
+        InputError: there is no such file, model or layout.
     """
     path = Path(thing)
     if path.is_dir() or path.suffix in (".mcap", ".part"):
@@ -32,7 +34,19 @@ def inspect(thing: str) -> tuple[dict, BagError | None]:
         return {**_model(thing), **same_name}, None
     if thing in layout_names() or path.suffix in (".yaml", ".yml"):
         return _layout(load_layout(thing)), None
+    if not path.exists() and path.name == thing and not path.suffix:
+        raise InputError(_unknown(thing))
     return _model(thing), None
+
+
+def _unknown(name: str) -> str:
+    near = nearest(name, (*model_names(), *layout_names()))
+    kind = "model" if near in model_names() else "layout"
+    hint = f", did you mean {kind} '{near}'?" if near else "."
+    return (
+        f"no model or layout '{name}'{hint} Shipped models: {', '.join(model_names())}; shipped layouts: "
+        f"{', '.join(layout_names())}; for a file or a bag give its path"
+    )
 
 
 def _bag(path: Path) -> tuple[dict, BagError | None]:
@@ -81,8 +95,11 @@ def _model(thing: str) -> dict:
 
 
 def as_text(summary: dict) -> str:
-    """Return a summary as `key  value` lines, nested parts indented; the terminal wraps long lists."""
-    return "\n".join(_lines(summary, ""))
+    """Return a summary as `key  value` lines, nested parts indented; the terminal wraps long lists.
+
+    The damage of a bag is left out, as the command ends with it as its error.
+    """
+    return "\n".join(_lines({key: value for key, value in summary.items() if key != "damage"}, ""))
 
 
 def _lines(value: dict, indent: str) -> list[str]:
@@ -91,13 +108,17 @@ def _lines(value: dict, indent: str) -> list[str]:
     for key, item in value.items():
         if isinstance(item, dict) and item:
             lines += [f"{indent}{key}", *_lines(item, indent + "  ")]
+        elif isinstance(item, (list, tuple)) and any(isinstance(part, dict) for part in item):
+            lines.append(f"{indent}{key}")
+            for number, part in enumerate(item, 1):
+                lines += [f"{indent}  {number}", *_lines(part, indent + "    ")]
         else:
             lines.append(f"{indent}{key:<{width}}{_brief(item)}")
     return lines
 
 
 def _brief(item: object) -> str:
-    if item is None:
+    if item is None or item in ({}, [], ()):
         return "-"
     if isinstance(item, float):
         return f"{item:.6g}"

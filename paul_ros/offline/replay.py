@@ -161,7 +161,7 @@ def replay(
                 raise
             done.damage = error
         if not node.keypoint_messages:
-            raise BagError(_no_keypoints(bag, topics))
+            raise BagError(no_keypoints(bag, topics))
     return done
 
 
@@ -261,7 +261,8 @@ class _OfflineNode:
             self.writer.write(f"{NODE_NAME}/layout", message, log_time, LATCHED_QOS)
 
 
-def _no_keypoints(bag: Path, topics: Topics) -> str:
+def no_keypoints(bag: Path, topics: Topics) -> str:
+    """Return the error for a bag without messages on the topic of the keypoints: what it holds, and what to do."""
     held = [f"{topic} ({kind})" for topic, (kind, _) in topics_of(bag).items()]
     return (
         f"{bag}: no messages on {topics.keypoints}; the bag holds {', '.join(held) or 'none at all'}. "

@@ -99,7 +99,7 @@ def load_sequence(path: str | Path) -> Sequence:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"no data file '{path}'")
+        raise DataError(f"{path}: no such file")
     try:
         arrays = read_npz(path, ("W", "S"), ("visible", "edges", "metres"))
     except NpzError as error:

@@ -70,7 +70,10 @@ def _strip(model: Model, sequence: Sequence, frames: tuple[int, int] | None) -> 
     """Return the shapes of one file, in the first frame's camera, and how much they change."""
     count, points = sequence.visible.shape
     if points != len(model.layout.names):
-        raise DataError(f"'{sequence.name}' has {points} points, model '{model.name}' {len(model.layout.names)}")
+        raise DataError(
+            f"'{sequence.name}' has {points} points, but model '{model.name}' has {len(model.layout.names)}: "
+            "give the model of these points with --model, or other --data"
+        )
     if frames and max(frames) >= count:
         raise DataError(f"'{sequence.name}' has frames 0 to {count - 1}, not {max(frames)}: choose others")
     first, last = frames or _farthest(model, sequence)
