@@ -52,6 +52,7 @@ WITHOUT_EXAMPLES = [
     "paul_ros.versions",
     "paul_ros.viewing_goal",
     "paul_ros.viewing_sphere",
+    "paul_ros.wording",
 ]
 
 

@@ -89,7 +89,7 @@ def test_the_node_lifts_yolo_ros(ros, start_lifter, model_file, compiled):
     lifter = start_lifter("-p", f"model:={model_file}")
     bench = Bench(ros, lifter, YOLO)
     bench.until(bench.keypoints.get_subscription_count, "a subscription")
-    bench.until(lambda: f"reading {YOLO}" in lifter.log(), "the log line")
+    bench.until(lambda: f"Reading {YOLO}" in lifter.log(), "the log line")
     bench.until(calibrated(bench), "metres")
     bench.until(bench_hears(bench, detections), "poses")
     found = bench.answer("poses", bench.send(detections)).poses
