@@ -9,7 +9,7 @@ import os
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -82,7 +82,8 @@ def write_atomically(path: str | os.PathLike, data: bytes) -> None:
 def write_npz(path: str | os.PathLike, arrays: Mapping[str, ArrayLike]) -> None:
     """Write arrays by name as an npz file, atomically."""
     with atomic_file(path) as file:
-        np.savez(file, **cast(dict[str, Any], dict(arrays)))
+        members: dict[str, Any] = dict(arrays)
+        np.savez(file, **members)
 
 
 def write_json(path: str | os.PathLike, report: dict) -> None:

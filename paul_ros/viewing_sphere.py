@@ -92,7 +92,7 @@ def solve(moments: np.ndarray, mean: np.ndarray, scale: Scale, rivals: bool = Tr
     inputs = (moments.reshape(N, 25), mean, a, axes.reshape(N, 9))
     if N <= FEW:
         rows = zip(*(part.tolist() for part in inputs))
-        table = np.array([_answer(Floats, row, scale, method) for row in rows], dtype=float).reshape(N, 28)
+        table: np.ndarray = np.array([_answer(Floats, row, scale, method) for row in rows], dtype=float).reshape(N, 28)
     else:
         columns = tuple(list(part.T.copy()) for part in inputs)
         with np.errstate(over="ignore"):  # of absurdly large means, which fix no pose

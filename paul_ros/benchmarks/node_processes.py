@@ -69,7 +69,7 @@ class NodeBench:
         """
         self.nodes: dict[str, subprocess.Popen] = {}
         self._folder, self._log, self._environment, self._processes = folder, log, environment, processes
-        self._arrived = np.zeros(0, ARRIVAL)
+        self._arrived: np.ndarray = np.zeros(0, ARRIVAL)
         self._unread = b""
         start = partial(process, environment=environment, log=log, stdout=subprocess.PIPE)
         self._publisher, self._listener = (

@@ -8,7 +8,7 @@ import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -60,9 +60,9 @@ class LiftedFile:
         for persons, lifted in batches:
             for name, values in _arrays(persons, lifted).items():
                 columns.setdefault(name, []).append(values)
-        whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+        whole: dict[str, Any] = {name: np.concatenate(parts) for name, parts in columns.items()}
         whole.update((name, np.array(value)) for name, value in self._stated.items())
-        np.savez(file, **cast(dict[str, Any], whole))
+        np.savez(file, **whole)
 
     def _write_csv(self, file: BinaryIO, batches: Batches) -> None:
         text = io.StringIO()

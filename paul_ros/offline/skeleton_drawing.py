@@ -45,7 +45,7 @@ def draw_skeleton(
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba
 
-    bones = np.asarray(edges, int).reshape(-1, 2)
+    bones: np.ndarray = np.asarray(edges, int).reshape(-1, 2)
     if depth is not None:
         bones = bones[np.argsort(-depth[bones].mean(1))]
     seen = np.ones(len(points), bool) if visible is None else visible
