@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings as robots leave them: split, unordered, compressed, cut, beside foreign channels, in other storages.
 
-The oracle knows every message that was written, and which file holds it. What is read must be these messages, each
-once, in order of log time. What is missing must be in a file that the error names.
+The oracle knows every message that was written, and which file holds it. The reader must give these messages, each
+once, in order of log time. The error must name each file of which a message is missing.
 """
 
 from __future__ import annotations

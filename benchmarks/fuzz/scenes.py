@@ -138,13 +138,13 @@ def random_camera(rng: random.Random) -> TrueCamera:
 
 @dataclass
 class Truth:
-    """What one image shows.
+    """The content of one image.
 
     Attributes:
         fault: what is wrong with its message.
         roots: (N,3) metres.
         ids: of the persons, as sent.
-        visible: whether the stated image shows all points.
+        detectable: whether the message shows that it has the fault.
     """
 
     fault: str
