@@ -1,20 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuzz test of all input from outside: does anything crash, is any message lost without being counted?
+"""Fuzz test of all input from outside: does anything crash, get lost without being counted, or mislead in silence?
 
     python -m benchmarks.fuzz [--cases 100000] [--seed 0] [--only KIND] [--json fuzz.json]
 
-A case is one message, serialised message, bag, model file or layout.  It is made whole and then broken in a few places:
+A case is one message, serialised message, scene, bag, recording, model file, layout or request.  Most are made whole
+and then broken in a few places:
 
 - fields: messages of every supported type.  Every field keeps its type, with NaN, infinite, huge or negative values,
   odd lengths and odd text.  Even a drop as `internal_error` is a crash here.
 - junk: the same with values of any type, None, nested rubbish and missing fields.  DDS cannot deliver such messages.
 - cdr: PointCloud2 as bytes, for the reader of serialised messages.  rosbags must read the same from them.
 - bags: bits flipped, bytes cut off, inserted and exchanged, and intact bags of broken messages; read and replayed.
+- scenes: persons before cameras with distortion, windows and binning, in messages whose pixels, confidences, ids or
+  order mean something else.  The truth is known.
+- recordings: split, unordered, compressed, cut, incomplete, beside foreign channels, in sqlite3.  All messages are
+  known.
 - models: the file, or its contents under a correct checksum.
 - layouts: the YAML text, or the values in it.
+- services: requests to a running node over DDS, by id and by label, with odd types and names.  It must lift afterwards.
 
 A crash is an exception that the documentation does not promise, a warning of NumPy, or an output that is not finite.
-A message is lost uncounted if it becomes neither a frame, nor a part of one, nor a drop.
+A message is lost uncounted if it becomes neither a frame, nor a part of one, nor a drop.  A silent misreading is an
+output that differs from the truth although no note and no drop says so, or a note about something that is right.
 
 A few cases make a session and share a stream.  `--only KIND --session NUMBER` repeats one session.
 """

@@ -7,8 +7,9 @@ import hashlib
 import io
 import json
 import random
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import foreign_messages as foreign
 import numpy as np
@@ -20,6 +21,9 @@ from paul_ros.model_file import load_model, weight_shapes
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.stream.messages import MessageBuilder
 from paul_ros.stream.stream import LiftStream
+
+if TYPE_CHECKING:
+    from benchmarks.fuzz.services import Node
 
 
 class Bench:
@@ -38,11 +42,27 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._node: Node | None = None
         self.model = load_model()
         self.live, self.bag = LiveMake(), BagMake(foreign.DEFINITIONS)
         self.tiny = _tiny_model()
         self.whole_bags = [_tiny_bag(folder / f"{name}.mcap", self.bag, name) for name in ("none", "lz4", "zstd")]
         self.objects, self.packed = MessageBuilder(self.bag), MessageBuilder(self.bag, packed=True)
+
+    def node(self) -> Node:
+        """Return the running node that all sessions share; the first call starts it."""
+        if self._node is None:
+            from benchmarks.fuzz.services import Node
+
+            with warnings.catch_warnings():
+                warnings.simplefilter("default")  # the imports of rclpy warn
+                self._node = Node(self.folder)
+        return self._node
+
+    def close(self) -> None:
+        """End the node."""
+        if self._node is not None:
+            self._node.close()
 
     def rewritten(self, message: Any, data: bytes) -> bytes:
         """Read and write a serialised message anew, because the value of padding is arbitrary."""

@@ -7,7 +7,6 @@ import functools
 import json
 import random
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -33,12 +32,6 @@ from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.judge import evaluate
 from paul_ros.offline.replay import Topics, replay
 from paul_ros.stream.stream import LiftStream
-
-SESSION = 25  # cases
-
-Session = Callable[[Bench, random.Random, Tally, int, str], None]
-"""Runs so many cases and counts them; the text names the session in failures."""
-
 
 # --- messages
 
@@ -330,21 +323,3 @@ def layout_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, w
 
 def _broken_layout(whole: dict[str, Any], rng: random.Random) -> bytes:
     return yaml.safe_dump(break_json(whole, rng)).encode() if rng.random() < 0.9 else yaml.safe_dump(whole).encode()
-
-
-SESSIONS: dict[str, Session] = {
-    "fields": fields_session,
-    "junk": junk_session,
-    "cdr": cdr_session,
-    "bags": bag_session,
-    "models": model_session,
-    "layouts": layout_session,
-}
-"""Kind -> session."""
-
-
-def run_session(bench: Bench, kind: str, number: int, tally: Tally, seed: int = 0, cases: int = SESSION) -> None:
-    """Run one session; equal numbers and seeds make equal cases."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # a warning of NumPy would be a cryptic line in the robot's log
-        SESSIONS[kind](bench, random.Random(f"{seed} {kind} {number}"), tally, cases, f"{kind} {number}")

@@ -25,6 +25,7 @@ class Tally:
         accepted: cases that became a frame or part of one, or were read.
         refused: cases that became counted drops or a promised error.
         crashes: cases that crashed.
+        misreadings: cases whose output is wrong, or whose fault has no note or drop.
         uncounted: sessions that lost messages uncounted, and errors that are not one line.
         slowest_ms: most processor time of a case.
         reasons: reasons of drops and names of errors.
@@ -36,6 +37,7 @@ class Tally:
     refused: int = 0
     crashes: int = 0
     uncounted: int = 0
+    misreadings: int = 0
     slowest_ms: float = 0.0
     reasons: Counter[str] = field(default_factory=Counter)
     failures: list[str] = field(default_factory=list)
@@ -48,6 +50,11 @@ class Tally:
     def lost(self, where: str, text: str) -> None:
         """Count a loss."""
         self.uncounted += 1
+        self._keep(f"{where}: {text}")
+
+    def misread(self, where: str, text: str) -> None:
+        """Count an output that is wrong although nothing says so, or a false alarm."""
+        self.misreadings += 1
         self._keep(f"{where}: {text}")
 
     def refuse(self, error: Exception, where: str) -> None:
