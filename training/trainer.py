@@ -13,9 +13,10 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
@@ -24,7 +25,6 @@ from torch import Tensor, nn
 from paul_ros.layout import Layout
 from training.batches import Batch, BatchSampler
 from training.checkpoint import (
-    CHECKPOINT,
     LOG_COLUMNS,
     LOSSES,
     restore_checkpoint,
@@ -42,6 +42,7 @@ from training.objective import Terms, paul_terms, regression_terms
 from training.optimiser import adam
 from training.progress import Progress
 from training.recipe import Recipe
+from training.run_folder import CHECKPOINT
 from training.schedule import REGRESSION, UNSUPERVISED, Schedule
 from training.start import search
 from training.start.kept_start import kept_start, start_identity
@@ -53,6 +54,9 @@ _WORST_SHARE = 0.1
 
 _AXES_VIEWS = 1000
 """Evenly chosen frames from which main axes are found."""
+
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a process."""
 
 _LOG_EVERY = 100
 _CHECKPOINT_SECONDS = 30.0
@@ -139,7 +143,7 @@ class Trainer:
             views = self.views(torch.from_numpy(self.start.rows))
             self._lesson = Lesson.of(self.start, views, self.data.layout, self.recipe.scale)
 
-    def run(self) -> Iterator[dict[str, Any]]:
+    def run(self) -> Generator[dict[str, Any], None, None]:
         """Train to the recipe's last step, yielding a row of the log after each step.
 
         A checkpoint is written at intervals, at the end, and when the caller stops iterating.
@@ -286,15 +290,20 @@ class _Objective(nn.Module):
 
 @contextmanager
 def _whole_step() -> Iterator[None]:
-    """Delay Ctrl-C to the end of the step: a checkpoint of half a step would not continue to the bit."""
+    """Delay signals to the end of the step: a checkpoint of half a step would not continue to the bit."""
     if threading.current_thread() is not threading.main_thread():  # only the main thread receives signals
         yield
         return
-    received: list[tuple] = []
-    before = signal.signal(signal.SIGINT, lambda *about: received.append(about))
+    received: list[int] = []
+
+    def receive(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    before = {number: signal.signal(number, receive) for number in _ENDING}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-    if received and callable(before):
-        before(*received[0])
+        for ending, handler in before.items():
+            signal.signal(ending, handler)
+    for number in received:
+        signal.raise_signal(number)
