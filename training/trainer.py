@@ -10,19 +10,16 @@ In that case fresh networks may do it all again, starting from the solutions of 
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Generator
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from paul_ros.layout import Layout
+from paul_ros.signals import delayed_signals, raise_signals
 from training.batches import Batch, BatchSampler
 from training.checkpoint import (
     LOG_COLUMNS,
@@ -54,9 +51,6 @@ _WORST_SHARE = 0.1
 
 _AXES_VIEWS = 1000
 """Evenly chosen frames from which main axes are found."""
-
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a process."""
 
 _LOG_EVERY = 100
 _CHECKPOINT_SECONDS = 30.0
@@ -157,8 +151,10 @@ class Trainer:
         saved, begun = time.monotonic(), time.monotonic() - self.seconds
         try:
             while not self.finished:
-                with _whole_step():
+                # A checkpoint of half a step would not continue to the bit.
+                with delayed_signals() as received:
                     row = self._advance(begun)
+                raise_signals(received)
                 if time.monotonic() - saved > _CHECKPOINT_SECONDS:
                     self.save()
                     saved = time.monotonic()
@@ -286,24 +282,3 @@ class _Objective(nn.Module):
         if batch.goal is None:
             return paul_terms(self.networks, self.layout, self.recipe, views, rows, share)
         return regression_terms(self.networks, self.layout, self.recipe, views, rows, batch.goal, share)
-
-
-@contextmanager
-def _whole_step() -> Iterator[None]:
-    """Delay signals to the end of the step: a checkpoint of half a step would not continue to the bit."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread receives signals
-        yield
-        return
-    received: list[int] = []
-
-    def receive(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-
-    before = {number: signal.signal(number, receive) for number in _ENDING}
-    try:
-        yield
-    finally:
-        for ending, handler in before.items():
-            signal.signal(ending, handler)
-    for number in received:
-        signal.raise_signal(number)

@@ -15,7 +15,7 @@ from collections.abc import Collection
 from paul_ros import __version__
 from paul_ros.cli.options import HelpFormatter
 from paul_ros.cli.parser import Parser
-from paul_ros.cli.signals import stoppable
+from paul_ros.signals import stoppable
 
 COMMANDS = {
     "lift": "lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
@@ -146,8 +146,8 @@ def _use_one_thread() -> None:
 
 def _text(error: Exception) -> str:
     """Return an error's text; that of a file begins with its name, as the package's own errors do."""
-    if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
 
 

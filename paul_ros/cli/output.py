@@ -24,9 +24,13 @@ def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | No
     Raises:
         OutputError: names the file and what to do.
     """
+    from paul_ros.errors import OutputError
     from paul_ros.output_files import check_outputs
 
-    check_outputs([path for path in outputs if path != STDOUT], inputs)
+    paths = list(outputs)
+    if STDOUT in paths and sys.stdout is None:
+        raise OutputError("standard output is closed: name a file")
+    check_outputs([path for path in paths if path != STDOUT], inputs)
 
 
 def check_suffix(path: Path | None, suffixes: Collection[str]) -> None:
@@ -84,8 +88,6 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
     from paul_ros.files import atomic_file
 
     if path == STDOUT:
-        if sys.stdout is None:
-            raise OSError("standard output is closed: name a file")
         yield sys.stdout.buffer
         return
     with atomic_file(path) as file:

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Signals that end a process: a command stops by any of them as by Ctrl-C, and work that must be whole delays them."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals of Ctrl-C, of `kill` or a service manager, and of a terminal that is closed."""
+
+
+@contextmanager
+def stoppable() -> Iterator[list[int]]:
+    """Raise KeyboardInterrupt in the block when SIGTERM or SIGHUP comes, unless the signal is ignored (`nohup`).
+
+    Yields:
+        The numbers of the signals that came, so far none.
+    """
+    received: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        for other in ENDING[1:]:
+            if other != number:  # a service manager sends both, and the second one would break the tidying
+                signal.signal(other, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    with _handlers(stop, [number for number in ENDING[1:] if signal.getsignal(number) == signal.SIG_DFL]):
+        yield received
+
+
+@contextmanager
+def delayed_signals() -> Iterator[list[int]]:
+    """Keep signals of ENDING from interrupting the block; hand the list that it yields to `raise_signals` afterwards."""
+    received: list[int] = []
+
+    def receive(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+
+    with _handlers(receive, ENDING):
+        yield received
+
+
+def raise_signals(received: Iterable[int]) -> None:
+    """Send this process the signals that were delayed."""
+    for number in received:
+        signal.raise_signal(number)
+
+
+@contextmanager
+def _handlers(handler: Callable[[int, FrameType | None], None], numbers: Iterable[int]) -> Iterator[None]:
+    """Set a handler during the block, in the main thread, which alone receives signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
