@@ -21,7 +21,7 @@ def check_output(path: Path) -> None:
     Raises:
         OutputError: the path is a folder, or the system refuses to write there.
     """
-    if path.is_dir():
+    if os.path.isdir(path):
         raise OutputError(f"cannot write {path}: it is a folder; name a file in it")
     try:
         _try_to_write(path)

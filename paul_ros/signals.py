@@ -13,9 +13,13 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals of Ctrl-C, of `kill` or a service manager, and of a terminal that is closed."""
 
 
+class Stopped(KeyboardInterrupt):
+    """A signal of ENDING came. (Python ends with the code of Ctrl-C after a plain KeyboardInterrupt in eval or exec.)"""
+
+
 @contextmanager
 def stoppable() -> Iterator[list[int]]:
-    """Raise KeyboardInterrupt in the block when SIGTERM or SIGHUP comes, unless the signal is ignored (`nohup`).
+    """Raise Stopped in the block when a signal of ENDING comes, unless it is ignored (`nohup`) or handled otherwise.
 
     Yields:
         The numbers of the signals that came, so far none.
@@ -24,18 +28,19 @@ def stoppable() -> Iterator[list[int]]:
 
     def stop(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        for other in ENDING[1:]:
+        for other in (signal.SIGTERM, signal.SIGHUP):
             if other != number:  # a service manager sends both, and the second one would break the tidying
                 signal.signal(other, signal.SIG_IGN)
-        raise KeyboardInterrupt
+        raise Stopped
 
-    with _handlers(stop, [number for number in ENDING[1:] if signal.getsignal(number) == signal.SIG_DFL]):
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    with _handlers(stop, [number for number in ENDING if signal.getsignal(number) in usual]):
         yield received
 
 
 @contextmanager
 def delayed_signals() -> Iterator[list[int]]:
-    """Keep signals of ENDING from interrupting the block; hand the list that it yields to `raise_signals` afterwards."""
+    """Keep signals of ENDING from interrupting the block; hand the yielded list to `raise_signals` afterwards."""
     received: list[int] = []
 
     def receive(number: int, frame: FrameType | None) -> None:
