@@ -14,7 +14,7 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal of ENDING came. (Python ends with the code of Ctrl-C after a plain KeyboardInterrupt in eval or exec.)"""
+    """A signal of ENDING came. (After a plain KeyboardInterrupt in exec, Python exits as by Ctrl-C.)"""
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from conftest import ROOT
 
 from paul_ros.signals import delayed_signals, raise_signals, stoppable
 
-ONE = ROOT / "bags/one_person.mcap"
+TWO = ROOT / "bags/two_persons_crossing.mcap"
 PATIENCE = 60
 KINDS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -26,7 +26,7 @@ def replay(out: Path, hang_up=signal.SIG_DFL) -> subprocess.Popen:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         signal.signal(signal.SIGHUP, hang_up)
 
-    words = [sys.executable, "-m", "paul_ros.cli", "replay", str(ONE), "-o", str(out)]
+    words = [sys.executable, "-m", "paul_ros.cli", "replay", str(TWO), "-o", str(out)]
     process = subprocess.Popen(
         words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=usual
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import importlib
 import io
 import os
@@ -97,9 +98,7 @@ def _run(argv: list[str]) -> int:
         _say(str(stop) or "stopped")
         return 128 + signal.SIGINT
     except Exception as error:
-        if isinstance(error, BrokenPipeError) and error.filename is None:
-            raise
-        if not _is_expected(error):
+        if not _is_expected(error) or _is_of_stdout(error):
             raise
         _say(" ".join(_text(error).split()))
         return 1
@@ -149,6 +148,11 @@ def _text(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
+
+
+def _is_of_stdout(error: Exception) -> bool:
+    """Return whether printing failed; errors of files name the file."""
+    return isinstance(error, OSError) and error.errno in (errno.EPIPE, errno.ENOSPC) and error.filename is None
 
 
 def _is_expected(error: Exception) -> bool:
