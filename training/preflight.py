@@ -21,7 +21,7 @@ from training.tensorboard import require_tensorboard
 
 @dataclass(frozen=True)
 class Job:
-    """What a session is to do, checked.
+    """A checked task for a session of training.
 
     Attributes:
         options: of the command.
