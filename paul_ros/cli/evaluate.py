@@ -72,6 +72,7 @@ def run(args: argparse.Namespace) -> None:
     from training.judge import evaluation
 
     if args.truth:
+        require("train", "torch")
         report, compared = evaluation.evaluate_shapes(args.model, args.truth)
     else:
         with progress("evaluate") as count:

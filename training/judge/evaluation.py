@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from paul_ros.errors import ModelError, NpzError
-from paul_ros.extras import require
 from paul_ros.files import read_npz
 from paul_ros.lifted import AMBIGUOUS, TOO_FEW_POINTS
 from paul_ros.model import Model
@@ -108,10 +107,9 @@ def evaluate_shapes(shapes: str | Path, truth_file: str | Path) -> tuple[dict[st
     Raises:
         DataError: the truth is missing, or the reconstruction has other frames or points.
     """
-    truth = load_sequence(truth_file)
-    require("train", "torch")  # takes seconds
     from training.reconstruction import load_reconstruction
 
+    truth = load_sequence(truth_file)
     try:
         found = load_reconstruction(shapes)
     except DataError as error:
