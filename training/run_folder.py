@@ -61,8 +61,7 @@ def _locked_descriptor(folder: Path) -> int:
         except BlockingIOError:
             os.close(descriptor)
             raise TrainingError(
-                f"{folder}: another training is running in this folder: wait for its end, stop it, or choose another "
-                "output"
+                f"{folder}: another training is running in this folder: wait for its end, stop it, or write elsewhere"
             ) from None
         except OSError as error:  # some network file systems have no locks
             print(f"note: {folder} cannot be locked ({error.strerror}): start no second one here", file=sys.stderr)

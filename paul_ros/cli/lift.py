@@ -209,8 +209,8 @@ def _kind(args: argparse.Namespace, path: Path, name: str) -> str:
     if path.suffix.lstrip(".") in FORMATS:
         return path.suffix.lstrip(".")
     if not args.format:
-        must = "" if path == STDOUT else "it must end in .npz, .csv or .json, or "
-        args.usage_error(f"{name} is {path}: {must}choose its format with --format npz, csv or json")
+        what = "-:" if path == STDOUT else f"'{path}': it must end in .npz, .csv or .json; otherwise"
+        args.usage_error(f"{name} is {what} choose its format with --format npz, csv or json")
     return args.format
 
 
