@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files: written atomically, and read without executing anything in them."""
+"""Files: written whole or not at all, and read without executing anything in them."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import io
 import json
 import os
-import tempfile
-from collections.abc import Collection, Iterator, Mapping
+import secrets
+import stat
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,6 +20,12 @@ from numpy.typing import ArrayLike
 from paul_ros.errors import NpzError
 
 _NAMED = 5  # most arrays that an error names
+
+PART = ".part"
+"""Suffix of a file that is being written. A killed process leaves such files."""
+
+_MOST_LINKS = 40  # that Linux follows
+_LONGEST_NAME = 255  # bytes
 
 
 def read_npz(
@@ -50,25 +59,161 @@ def read_npz(
     return arrays
 
 
-@contextlib.contextmanager
-def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
-    """Open a file for writing that is complete or unchanged when the block ends; missing folders are made.
+def is_stream(path: str | os.PathLike) -> bool:
+    """Return whether a path leads to a device, a pipe or an open descriptor, which are written and never replaced.
 
     Raises:
-        OSError: the file cannot be written. The error names the file, never the temporary one.
+        OSError: the path cannot be followed, for example a loop of links.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    if _descriptor(path) is not None:
+        return True
     try:
-        with os.fdopen(handle, "wb") as file:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+
+
+def make_folders(folder: Path) -> list[Path]:
+    """Make a folder and its parents; return those that were missing, the deepest first."""
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def remove_if_empty(folders: Iterable[Path]) -> None:
+    """Remove folders up to the first one that holds something."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
+
+
+@contextlib.contextmanager
+def atomic_file(path: str | os.PathLike, buffering: int = -1) -> Iterator[BinaryIO]:
+    """Open an output that is complete when the block ends, and unchanged if the block raises.
+
+    The bytes go to `NAME.RANDOM.part` beside the file, which then takes the file's place in one step. Several writers
+    of one name do not meet: the last one to end wins, with a whole file. A block that raises leaves neither the `.part`
+    file nor folders that were made for it. A killed process leaves its `.part` file.
+
+    Missing folders are made. The target of a link is written, and the link stays. An existing file keeps its
+    permissions and its owner. Devices, pipes and open descriptors (/dev/null, /dev/fd/3) are written straight.
+
+    Args:
+        path: of the output.
+        buffering: as for `open`.
+
+    Raises:
+        OSError: the file cannot be written. The error names `path`, never the temporary file.
+    """
+    with _naming(path):
+        straight = is_stream(path)
+    with (_stream if straight else _replacement)(path, buffering) as file:
+        yield file
+
+
+@contextlib.contextmanager
+def _replacement(path: str | os.PathLike, buffering: int) -> Iterator[BinaryIO]:
+    """Open a file beside the target of `path`, which replaces it when the block ends."""
+    target = Path(os.path.realpath(path))
+    part = _part_of(target)
+    with _naming(path):
+        made = make_folders(target.parent)
+    try:
+        with _naming(path):
+            if target.is_file() and not os.access(target, os.W_OK, effective_ids=True):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            # "x": the name is of this process alone.
+            file = open(part, "xb", buffering)
+        # A full disk names no file.
+        with _naming(path, None, str(part)):
+            with file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+        with _naming(path):
+            _copy_access(target, part)
+            os.replace(part, target)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        remove_if_empty(made)
+        raise
+
+
+@contextlib.contextmanager
+def _stream(path: str | os.PathLike, buffering: int) -> Iterator[BinaryIO]:
+    """Open a device, a pipe or a descriptor for writing from front to end."""
+    with _naming(path):
+        descriptor = _descriptor(path)
+        # A descriptor is shared and not opened anew, so that what others write to it stays where it is.
+        raw = os.open(path, os.O_WRONLY) if descriptor is None else os.dup(descriptor)
+    with _naming(path, None):
+        with _Forward(raw) as file:
             yield file
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException as error:
-        os.unlink(temporary)
-        # A full disk names no file, and a refused rename names the temporary one.
-        if isinstance(error, OSError) and error.errno and error.filename in (None, temporary):
+
+
+class _Forward(io.BufferedWriter):
+    """Writes from front to end: knows its position, counted from where it began, and cannot change it."""
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__(io.FileIO(descriptor, "wb"))
+        self._written = 0
+
+    def write(self, data: Any) -> int:
+        count = super().write(data)
+        self._written += count
+        return count
+
+    def tell(self) -> int:
+        return self._written
+
+    def seekable(self) -> bool:
+        return False
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        raise io.UnsupportedOperation("a stream is written from front to end")
+
+
+def _descriptor(path: str | os.PathLike) -> int | None:
+    """Return the open descriptor that a name such as /dev/stdout or /dev/fd/3 stands for; None = it is another file."""
+    link = os.path.abspath(path)
+    for _ in range(_MOST_LINKS):
+        folder, name = os.path.split(link)
+        folder = os.path.realpath(folder)
+        if folder == f"/proc/{os.getpid()}/fd" and name.isdecimal():
+            return int(name)
+        link = os.path.join(folder, name)
+        if not os.path.islink(link):
+            break
+        link = os.path.join(folder, os.readlink(link))
+    return None
+
+
+def _part_of(target: Path) -> Path:
+    """Return a new name for a file that is being written, beside its target."""
+    end = f".{secrets.token_hex(4)}{PART}"
+    begin = os.fsdecode(os.fsencode(target.name)[: _LONGEST_NAME - len(end)])
+    return target.with_name(begin + end)
+
+
+def _copy_access(target: Path, part: Path) -> None:
+    """Give a file the permissions of the one that it replaces, and its owner, as far as the file system allows."""
+    if target.exists():
+        before = target.stat()
+        with contextlib.suppress(OSError):
+            os.chown(part, before.st_uid, before.st_gid)
+        with contextlib.suppress(OSError):
+            os.chmod(part, before.st_mode & 0o777)
+
+
+@contextlib.contextmanager
+def _naming(path: str | os.PathLike, *names: str | None) -> Iterator[None]:
+    """Make an OSError name `path`: every one, or only one that names one of `names` (None = names no file)."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno and (not names or error.filename in names):
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
 
@@ -88,4 +233,5 @@ def write_npz(path: str | os.PathLike, arrays: Mapping[str, ArrayLike]) -> None:
 
 def write_json(path: str | os.PathLike, report: dict) -> None:
     """Write a report as one JSON object, atomically."""
-    write_atomically(path, (json.dumps(report, indent=2, ensure_ascii=False) + "\n").encode())
+    # Names of files may hold bytes that are no UTF-8; JSON has escapes for them.
+    write_atomically(path, (json.dumps(report, indent=2, ensure_ascii=False) + "\n").encode(errors="backslashreplace"))

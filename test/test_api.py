@@ -48,6 +48,7 @@ WITHOUT_EXAMPLES = [
     "paul_ros.pinhole_pose",
     "paul_ros.placement",
     "paul_ros.route",
+    "paul_ros.signals",
     "paul_ros.shape_fit",
     "paul_ros.versions",
     "paul_ros.viewing_goal",

@@ -189,8 +189,9 @@ def test_cpu_time_of_another_process():
         child.communicate(b"\n")
 
 
-def test_ctrl_c_ends_every_process():
-    """SIGINT to the command alone, as from another program: nobody is left behind."""
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_every_process(kind):
+    """It comes to the command alone, as from another program: nobody is left behind."""
     command = subprocess.Popen(
         [sys.executable, "-m", "paul_ros.cli", "benchmark", "node", "--seconds", "60"],
         cwd=ROOT,
@@ -203,8 +204,8 @@ def test_ctrl_c_ends_every_process():
         while len(group(command.pid)) < 4:
             assert time.monotonic() < end and command.poll() is None
             time.sleep(0.05)
-        command.send_signal(signal.SIGINT)
-        assert command.wait(30) == 130
+        command.send_signal(kind)
+        assert command.wait(30) == 128 + kind
         assert command.stderr.read().strip() == b"paul: stopped"
         assert not group(command.pid)
     finally:

@@ -12,9 +12,8 @@ from paul_ros.layout import Layout, anonymous_layout, load_layout
 from paul_ros.model_file import check_size, dictionary_sizes, load_model, save_model, weight_shapes
 from paul_ros.normalisation import normalise, to_centre, to_unit_size, upright
 from training import networks as networks_module
-from training.export import architecture
 from training.networks import build_networks, main_axes
-from training.recipe import Recipe
+from training.recipe import Recipe, architecture
 
 COCO = load_layout("coco17")
 

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from tiny_data import sequence
 
 from paul_ros.model_file import load_model, save_model
 from training.errors import DataError
 from training.options import TrainingOptions
+from training.preflight import prepare
 from training.recipe import Recipe
-from training.sources import is_motion_capture, loader_of
+from training.sources import is_motion_capture
 
 ROOT = Path(__file__).resolve().parent.parent
 BAG = ROOT / "bags" / "one_person.mcap"
@@ -44,7 +44,7 @@ def test_motion_capture_is_a_folder_of_its_files_that_is_no_bag(tmp_path):
 def test_a_folder_without_data_is_explained(tmp_path):
     options = TrainingOptions(data=(tmp_path,), model=tmp_path / "m.npz", recipe="default")
     with pytest.raises(DataError, match="no .mcap file in this folder, and no motion capture"):
-        loader_of(options)(options, Recipe(), torch.device("cpu"))
+        prepare(options)
 
 
 TRAIN = """
@@ -86,9 +86,10 @@ def test_training_without_torch_says_what_to_install(tmp_path):
 import sys
 sys.modules["torch"] = None
 from paul_ros.cli import main
-sys.exit(main(["train", "views.npz", "-o", "m.npz"]) != 1)
+sys.exit(main(["train", *sys.argv[1:]]) != 1)
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    words = [sys.executable, "-c", code, str(BAG), "-o", str(tmp_path / "m.npz")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and "'torch' is missing: pip install '.[train]' in a clone of paul_ros" in done.stderr
 
 

@@ -16,8 +16,7 @@ from training.data import TrainingData
 from training.distributed import from_first
 from training.errors import TrainingError
 from training.recipe import Recipe
-
-CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
+from training.run_folder import CHECKPOINT, LOG
 
 LOSSES = ("loss", "recon_ae", "recon_ad", "code", "handedness", "bones", "nuclear")
 """Columns of the log that are fields of ``objective.Terms``."""

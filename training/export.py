@@ -18,7 +18,7 @@ from training.chirality import CLEAR_SHARE, rule_share, same_side_share
 from training.data import TrainingData
 from training.networks import Paul
 from training.objective import fit
-from training.recipe import Recipe
+from training.recipe import architecture
 from training.trainer import Trainer
 from training.views import NormalisedViews
 
@@ -70,22 +70,6 @@ def export_model(trainer: Trainer, loss: float, path: Path, command: str) -> dic
     }
     save_model(path, header, {**_weights(trainer), "mean_shape": mean})
     return header
-
-
-def architecture(recipe: Recipe) -> dict:
-    """Return the part of the header that describes the networks."""
-    return {
-        "bottleneck": recipe.bottleneck,
-        "architecture": {
-            "encoder": {
-                "kind": recipe.encoder,
-                "width": recipe.width,
-                "blocks": recipe.blocks,
-                "upright": recipe.upright,
-            },
-            "decoder": {"kind": "mlp", "hidden": list(recipe.hidden)},
-        },
-    }
 
 
 def _scale(trainer: Trainer) -> dict:

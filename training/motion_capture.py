@@ -4,37 +4,48 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-import torch
-
-from paul_ros.layout import load_layout
+from paul_ros.layout import Layout, load_layout
 from training.data import TrainingData
-from training.distributed import from_first
 from training.errors import DataError, MocapError
 from training.loading import load_training_data
 from training.options import TrainingOptions
 from training.people.human_data import check_outside, make_file, views_of
 from training.people.human_points import human_layout
-from training.preflight import check_recipe
 from training.recipe import Recipe
+
+if TYPE_CHECKING:
+    import torch
 
 VIEWS_FILE = "views.npz"
 """File of the views in the run's folder."""
 
 
-def check_outputs_outside(options: TrainingOptions) -> None:
-    """Check that no output lies in the folder that is read, before the run's folder is made.
+def check_motion_capture(options: TrainingOptions, recipe: Recipe) -> Layout:
+    """Check all but the files of motion capture, since views take minutes; return the layout of the points.
 
     Raises:
-        MocapError: the next run would take an output for motion capture.
+        RecipeError: the recipe has no settings of views.
+        DataError: the layout has other points than motion capture gives.
+        MocapError: an output lies in the folder that is read, and the next run would take it for motion capture.
     """
     check_outside(options.data[0], options.outputs)
+    views_of(recipe)
+    own = human_layout()
+    layout = load_layout(options.layout) if options.layout else own
+    if len(own.names) != len(layout.names):
+        raise DataError(
+            f"motion capture gives the {len(own.names)} points of layout {own.name}, not the {len(layout.names)} of "
+            f"{layout.name}: leave out --layout {options.layout}"
+        )
+    return layout
 
 
 def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
     """Make views of a folder of motion capture, or load those that the run's folder keeps.
 
-    Views take minutes, so everything else is checked first. Only the first process makes them.
+    Only the first process makes them.
 
     Args:
         options: of the command.
@@ -45,19 +56,11 @@ def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.
         The data, and the recipe with all settings of the views.
 
     Raises:
-        RecipeError: the recipe has no views, or does not fit the layout.
-        DataError: the layout has other points than motion capture gives.
         MocapError: the files cannot be used.
     """
+    from training.distributed import from_first  # with torch, which takes seconds
+
     settings, path = views_of(recipe), options.run_folder / VIEWS_FILE
-    own = human_layout()
-    layout = load_layout(options.layout) if options.layout else own
-    if len(own.names) != len(layout.names):
-        raise DataError(
-            f"motion capture gives the {len(own.names)} points of layout {own.name}, not the {len(layout.names)} of "
-            f"{layout.name}: leave out --layout {options.layout}"
-        )
-    check_recipe(options, recipe, layout)
 
     def make() -> bytes | None:
         # An error that only one process raised would leave the others waiting: all get its text.
@@ -71,4 +74,4 @@ def load_motion_capture(options: TrainingOptions, recipe: Recipe, device: torch.
 
     if failure := from_first(make, device):
         raise MocapError(failure.decode())
-    return load_training_data(path, layout), replace(recipe, views=settings.to_dict())
+    return load_training_data(path, check_motion_capture(options, recipe)), replace(recipe, views=settings.to_dict())

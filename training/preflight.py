@@ -1,26 +1,65 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks before the first step: everything that can be refused early is refused here."""
+"""Everything that can be refused before the first step, and before torch is imported, which takes seconds."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from paul_ros.layout import Layout
 from paul_ros.model_file import check_size
 from paul_ros.output_files import check_outputs
-from training.checkpoint import CHECKPOINT, LOG
+from training.data import TrainingData
 from training.errors import DataError, RecipeError, TrainingError
-from training.export import architecture
 from training.options import TrainingOptions
-from training.recipe import Recipe
-from training.start.kept_start import START
+from training.recipe import Recipe, architecture
+from training.run_folder import RUN_FILES, restarts, run_folder
+from training.sources import is_motion_capture, load_keypoints
 from training.tensorboard import require_tensorboard
 
-RUN_FILES = (CHECKPOINT, LOG, START)
-"""Files that a run keeps in its folder."""
+
+@dataclass(frozen=True)
+class Job:
+    """A checked task for a session of training.
+
+    Attributes:
+        options: of the command.
+        recipe: with the options' overrides.
+        folders: of the runs, one for each restart.
+        data: of files; None for a folder of motion capture, whose views the session makes or continues with.
+    """
+
+    options: TrainingOptions
+    recipe: Recipe
+    folders: tuple[Path, ...]
+    data: TrainingData | None
 
 
-def check_options(options: TrainingOptions, recipe: Recipe, run_folders: list[Path]) -> None:
+def prepare(options: TrainingOptions) -> Job:
+    """Check all options, and load the data unless it has to be made.
+
+    Nothing is written.
+
+    Raises:
+        PaulError: bad data, recipe, layout or file.
+    """
+    recipe = Recipe.load(options.recipe, options.overrides)
+    folders = tuple(run_folder(options.run_folder, recipe, one.seed) for one in restarts(recipe))
+    if is_motion_capture(options.data):
+        from training.motion_capture import check_motion_capture
+
+        layout = check_motion_capture(options, recipe)
+        check_options(options, recipe, folders)
+        check_recipe(options, recipe, layout)
+        return Job(options, recipe, folders, None)
+    check_options(options, recipe, folders)
+    data = load_keypoints(options)
+    check_recipe(options, recipe, data.layout)
+    return Job(options, replace(recipe, views=None), folders, data)
+
+
+def check_options(options: TrainingOptions, recipe: Recipe, run_folders: Sequence[Path]) -> None:
     """Check the number of threads, the packages, and all files to be written.
 
     Raises:

@@ -217,6 +217,22 @@ def recipe_names() -> list[str]:
     return sorted(item.name[:-5] for item in folder.iterdir() if item.name.endswith(".yaml"))
 
 
+def architecture(recipe: Recipe) -> dict[str, Any]:
+    """Return the part of a model file's header that describes the networks."""
+    return {
+        "bottleneck": recipe.bottleneck,
+        "architecture": {
+            "encoder": {
+                "kind": recipe.encoder,
+                "width": recipe.width,
+                "blocks": recipe.blocks,
+                "upright": recipe.upright,
+            },
+            "decoder": {"kind": "mlp", "hidden": list(recipe.hidden)},
+        },
+    }
+
+
 def _read(name_or_path: str | Path) -> dict[str, Any]:
     text = str(name_or_path)
     path = resources.files("training") / "recipes" / f"{text}.yaml" if text in recipe_names() else Path(text)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from training.errors import DataError, TrainingError
 from training.objective import fit, paul_terms
 from training.progress import Progress, ignore_progress
 from training.recipe import Recipe
+from training.run_folder import restarts, run_folder
 from training.solver import centre
 from training.start.search import START_UNIT
 from training.start.start import Start
@@ -147,16 +148,6 @@ def train_restarts(
     if diverged and all(math.isinf(run.loss) for run in runs):
         raise diverged
     return sorted(runs, key=lambda run: run.loss)
-
-
-def restarts(recipe: Recipe) -> list[Recipe]:
-    """Return a recipe for each restart; seeds count up from the recipe's."""
-    return [replace(recipe, seed=recipe.seed + number, restarts=1) for number in range(recipe.restarts)]
-
-
-def run_folder(folder: Path, recipe: Recipe, seed: int) -> Path:
-    """Return the folder of a restart: the given folder itself if there is only one."""
-    return folder if recipe.restarts == 1 else folder / f"seed_{seed}"
 
 
 def reconstruct(

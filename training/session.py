@@ -7,7 +7,8 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,16 +18,16 @@ import torch
 from training.chirality import chirality_text
 from training.data import TrainingData
 from training.data_checks import check_sizes
-from training.distributed import is_first, joined
+from training.distributed import from_first, is_first, joined
 from training.encoder_fit import fit_encoder
 from training.errors import TrainingError
 from training.export import export_model
 from training.options import TrainingOptions
-from training.preflight import RUN_FILES, check_options
+from training.preflight import Job
 from training.progress import progress_bar, share_bar
 from training.recipe import Recipe
-from training.reconstruction import FinishedRun, reconstruction_of, restarts, run_folder, train_restarts
-from training.sources import loader_of
+from training.reconstruction import FinishedRun, reconstruction_of, train_restarts
+from training.run_folder import RUN_FILES, locked
 from training.tensorboard import FOLDER as BOARD_FOLDER
 from training.tensorboard import Board
 from training.trainer import Trainer
@@ -47,30 +48,57 @@ class Results(NamedTuple):
     text: str
 
 
-def train(options: TrainingOptions) -> Results | None:
+def train(job: Job) -> Results | None:
     """Train, or continue, and write model and shapes.
 
     Returns:
         The results; None in all processes but the first.
 
     Raises:
-        PaulError: bad data, recipe or file.
+        PaulError: bad data or file, or another training runs in the folder of the run.
         KeyboardInterrupt: its text says what was stopped and how to go on.
     """
-    recipe = Recipe.load(options.recipe, options.overrides)
-    folders = [run_folder(options.run_folder, recipe, one.seed) for one in restarts(recipe)]
-    load = loader_of(options)
-    check_options(options, recipe, folders)
+    options = job.options
     torch.set_num_threads(options.threads)
     device = training_device(options.device)
-    with joined(device):
-        data, recipe = load(options, recipe, device)
+    with joined(device), _locked(options.run_folder, device):
+        data, recipe = _loaded(job, device)
         data = replace(data, notes=(*data.notes, *check_sizes(data, recipe.scale), *_unused(data, recipe, options)))
         if options.fresh and is_first():
-            _delete_runs(folders)
+            _delete_runs(job.folders)
         _introduce(data)
         runs = train_restarts(data, recipe, options.run_folder, device, lambda trainer: _watch(trainer, options))
         return _write_results(runs, options) if is_first() else None
+
+
+def _loaded(job: Job, device: torch.device) -> tuple[TrainingData, Recipe]:
+    """Return data and recipe; only motion capture imports ``training.people``."""
+    if job.data is not None:
+        return job.data, job.recipe
+    from training.motion_capture import load_motion_capture
+
+    return load_motion_capture(job.options, job.recipe, device)
+
+
+@contextmanager
+def _locked(folder: Path, device: torch.device) -> Iterator[None]:
+    """Lock the folder in the first process. All processes raise its refusal, so that none waits for the others.
+
+    Raises:
+        TrainingError: another training runs there, or the folder cannot be made.
+    """
+    with ExitStack() as held:
+
+        def lock() -> bytes | None:
+            try:
+                held.enter_context(locked(folder))
+            except (TrainingError, OSError) as error:
+                return str(error).encode(errors="backslashreplace")
+            return None
+
+        if refusal := from_first(lock, device):
+            raise TrainingError(refusal.decode())
+        yield
 
 
 def training_device(name: str) -> torch.device:
@@ -106,7 +134,7 @@ def _unused(data: TrainingData, recipe: Recipe, options: TrainingOptions) -> tup
     return tuple(notes)
 
 
-def _delete_runs(folders: list[Path]) -> None:
+def _delete_runs(folders: Iterable[Path]) -> None:
     """Delete the files of runs; other files in the folders stay."""
     for folder in folders:
         for name in RUN_FILES:
@@ -134,13 +162,14 @@ def _watch(trainer: Trainer, options: TrainingOptions) -> None:
             with share_bar(quiet, f"{trainer.recipe.start} start") as progress:
                 trainer.prepare(progress)
         with progress_bar(quiet or not trainer.steps, total=trainer.steps, initial=begun, unit="step") as bar:
-            for row in trainer.run():
-                bar.update()
-                if board:
-                    board.write(row)
-                if row["step"] % _BAR_EVERY == 0:
-                    losses = {"loss": row["loss"], "ae": row["recon_ae"], "ad": row["recon_ad"]}
-                    bar.set_postfix({name: f"{value:.4f}" for name, value in losses.items()}, refresh=False)
+            with closing(trainer.run()) as rows:  # closing writes the checkpoint
+                for row in rows:
+                    bar.update()
+                    if board:
+                        board.write(row)
+                    if row["step"] % _BAR_EVERY == 0:
+                        losses = {"loss": row["loss"], "ae": row["recon_ae"], "ad": row["recon_ad"]}
+                        bar.set_postfix({name: f"{value:.4f}" for name, value in losses.items()}, refresh=False)
     except KeyboardInterrupt:
         if trainer.recipe.start != "random" and trainer.start is None:
             raise KeyboardInterrupt("stopped while searching for a start: the same command begins again") from None

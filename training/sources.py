@@ -3,40 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-
-import torch
 
 from paul_ros.layout import load_layout
 from training.categories import load_files
 from training.data import TrainingData
 from training.errors import DataError
 from training.options import TrainingOptions
-from training.preflight import check_recipe
-from training.recipe import Recipe
-
-Loader = Callable[[TrainingOptions, Recipe, torch.device], tuple[TrainingData, Recipe]]
-"""Loads the data, and completes the recipe by what the kind of data needs.
-
-The recipe's ``views`` are then complete for motion capture and None for other data. The recipe fits the layout of the
-data (``check_recipe``) before any long work begins.
-"""
-
-
-def loader_of(options: TrainingOptions) -> Loader:
-    """Return the loader for the kind of data. Only a folder of motion capture imports ``training.people``.
-
-    Raises:
-        MocapError: an output lies in the folder of motion capture.
-    """
-    if not is_motion_capture(options.data):
-        return load_keypoints
-    from training.motion_capture import check_outputs_outside, load_motion_capture
-
-    check_outputs_outside(options)
-    return load_motion_capture
 
 
 def is_motion_capture(paths: Sequence[Path]) -> bool:
@@ -49,19 +23,16 @@ def is_motion_capture(paths: Sequence[Path]) -> bool:
     return bool(motion_files(path))
 
 
-def load_keypoints(options: TrainingOptions, recipe: Recipe, device: torch.device) -> tuple[TrainingData, Recipe]:
-    """Load npz files and bags in every process; see ``Loader``.
+def load_keypoints(options: TrainingOptions) -> TrainingData:
+    """Load npz files and bags.
 
     Raises:
         DataError, BagError, LayoutError: see ``load_files``; or a folder holds no data.
-        RecipeError, ModelError: see ``check_recipe``.
     """
     for path in options.data:
         _check_folder(Path(path))
     layout = load_layout(options.layout) if options.layout else None
-    data = load_files(options.data, layout, options.topic, options.min_confidence)
-    check_recipe(options, recipe, data.layout)
-    return data, replace(recipe, views=None)
+    return load_files(options.data, layout, options.topic, options.min_confidence)
 
 
 def _check_folder(path: Path) -> None:

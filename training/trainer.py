@@ -10,11 +10,8 @@ In that case fresh networks may do it all again, starting from the solutions of 
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +19,9 @@ import torch
 from torch import Tensor, nn
 
 from paul_ros.layout import Layout
+from paul_ros.signals import delayed_signals, raise_signals
 from training.batches import Batch, BatchSampler
 from training.checkpoint import (
-    CHECKPOINT,
     LOG_COLUMNS,
     LOSSES,
     restore_checkpoint,
@@ -42,6 +39,7 @@ from training.objective import Terms, paul_terms, regression_terms
 from training.optimiser import adam
 from training.progress import Progress
 from training.recipe import Recipe
+from training.run_folder import CHECKPOINT
 from training.schedule import REGRESSION, UNSUPERVISED, Schedule
 from training.start import search
 from training.start.kept_start import kept_start, start_identity
@@ -139,7 +137,7 @@ class Trainer:
             views = self.views(torch.from_numpy(self.start.rows))
             self._lesson = Lesson.of(self.start, views, self.data.layout, self.recipe.scale)
 
-    def run(self) -> Iterator[dict[str, Any]]:
+    def run(self) -> Generator[dict[str, Any], None, None]:
         """Train to the recipe's last step, yielding a row of the log after each step.
 
         A checkpoint is written at intervals, at the end, and when the caller stops iterating.
@@ -153,8 +151,10 @@ class Trainer:
         saved, begun = time.monotonic(), time.monotonic() - self.seconds
         try:
             while not self.finished:
-                with _whole_step():
+                # A checkpoint of half a step would not continue to the bit.
+                with delayed_signals() as received:
                     row = self._advance(begun)
+                raise_signals(received)
                 if time.monotonic() - saved > _CHECKPOINT_SECONDS:
                     self.save()
                     saved = time.monotonic()
@@ -282,19 +282,3 @@ class _Objective(nn.Module):
         if batch.goal is None:
             return paul_terms(self.networks, self.layout, self.recipe, views, rows, share)
         return regression_terms(self.networks, self.layout, self.recipe, views, rows, batch.goal, share)
-
-
-@contextmanager
-def _whole_step() -> Iterator[None]:
-    """Delay Ctrl-C to the end of the step: a checkpoint of half a step would not continue to the bit."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread receives signals
-        yield
-        return
-    received: list[tuple] = []
-    before = signal.signal(signal.SIGINT, lambda *about: received.append(about))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if received and callable(before):
-        before(*received[0])

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import errno
 import importlib
+import io
 import os
 import signal
 import sys
@@ -13,6 +16,7 @@ from collections.abc import Collection
 from paul_ros import __version__
 from paul_ros.cli.options import HelpFormatter
 from paul_ros.cli.parser import Parser
+from paul_ros.signals import stoppable
 
 COMMANDS = {
     "lift": "lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",
@@ -36,8 +40,10 @@ exit codes:
   0:   success
   1:   an error that you can mend, explained in one line on standard error
   2:   wrong usage
+  129: the terminal was closed (SIGHUP)
   130: interrupted by Ctrl-C
   141: the reader of standard output has gone
+  143: ended by SIGTERM
 """
 
 
@@ -48,17 +54,37 @@ def main(argv: list[str] | None = None) -> int:
         argv: words after `paul`; None takes those of the process.
 
     Returns:
-        The exit code. 0: success. 1: an error that the user can mend, one line on standard error. 130: interrupted.
-        141: the reader of standard output has gone (`paul ... | head`), as a shell reports SIGPIPE.
+        The exit code. 0: success. 1: an error that the user can mend, one line on standard error. 128 and a signal's
+        number: 129, 130 and 143 as stopped by it; 141 if the reader of standard output has gone (`paul ... | head`).
     """
+    _print_any_text()
+    with stoppable() as received:
+        code = _run_and_flush(sys.argv[1:] if argv is None else argv)
+    return 128 + received[0] if received else code
+
+
+def _print_any_text() -> None:
+    """Let the terminal's encoding, such as ASCII, not stop a command: characters that it lacks are escaped."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _run_and_flush(argv: list[str]) -> int:
+    code = 0
     try:
         try:
-            return _run(sys.argv[1:] if argv is None else argv)
+            code = _run(argv)
+            return code
         finally:
-            print(end="", flush=True)  # here, since nothing catches a closed pipe at exit
-    except BrokenPipeError:
+            print(end="", flush=True)  # here, since nothing catches a closed pipe or a full disk at exit
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
+        if isinstance(error, BrokenPipeError):
+            return 128 + signal.SIGPIPE
+        if not code:
+            _say(f"standard output: {error.strerror}")
+        return 1
 
 
 def _run(argv: list[str]) -> int:
@@ -69,16 +95,20 @@ def _run(argv: list[str]) -> int:
         args = parser.parse_args(argv)
         args.run(args)
     except KeyboardInterrupt as stop:
-        print(f"paul: {str(stop) or 'stopped'}", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        raise
+        _say(str(stop) or "stopped")
+        return 128 + signal.SIGINT
     except Exception as error:
-        if not _is_expected(error):
+        if not _is_expected(error) or _is_of_stdout(error):
             raise
-        print(f"paul: {' '.join(_text(error).split())}", file=sys.stderr)
+        _say(" ".join(_text(error).split()))
         return 1
     return 0
+
+
+def _say(line: str) -> None:
+    """Print a line on standard error, if it is still there: the terminal may be closed."""
+    with contextlib.suppress(OSError):
+        print(f"paul: {line}", file=sys.stderr)
 
 
 def build_parser(wanted: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
@@ -115,9 +145,14 @@ def _use_one_thread() -> None:
 
 def _text(error: Exception) -> str:
     """Return an error's text; that of a file begins with its name, as the package's own errors do."""
-    if isinstance(error, OSError) and error.filename and error.strerror:
-        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
+
+
+def _is_of_stdout(error: Exception) -> bool:
+    """Return whether printing failed; errors of files name the file."""
+    return isinstance(error, OSError) and error.errno in (errno.EPIPE, errno.ENOSPC) and error.filename is None
 
 
 def _is_expected(error: Exception) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_layout, add_person_height
-from paul_ros.cli.output import STDOUT, check_files, open_output
+from paul_ros.cli.output import STDOUT, check_files, open_output, output_path
 from paul_ros.cli.progress import progress
 from paul_ros.stream.parameters import DEFAULTS
 from paul_ros.wording import quantity
@@ -82,11 +82,11 @@ def add_parser(commands: Commands) -> None:
         "-o",
         "--output",
         metavar="OUT",
-        type=Path,
+        type=output_path,
         required=True,
         help="3D points: .npz, .csv, .json, or - (standard output)",
     )
-    parser.add_argument("--format", choices=FORMATS, help="format of standard input and standard output")
+    parser.add_argument("--format", choices=FORMATS, help="format of files whose names do not say it, such as -")
     parser.add_argument(
         "--layout",
         help="layout of the keypoints: a name or a .yaml file "
@@ -207,14 +207,13 @@ def _notes(tally: Counter[str], camera: Intrinsics | None, layout: str) -> list[
 
 
 def _kind(args: argparse.Namespace, path: Path, name: str) -> str:
-    """Return the format of a file by its suffix, or that of a standard stream by --format; exit on wrong usage."""
-    if path == STDOUT:
-        if not args.format:
-            args.usage_error(f"{name} is -: choose its format with --format npz, csv or json")
-        return args.format
-    if path.suffix.lstrip(".") not in FORMATS:
-        args.usage_error(f"{name} is '{path}': it must end in .npz, .csv or .json")
-    return path.suffix.lstrip(".")
+    """Return the format of a file by its suffix, else by --format; exit on wrong usage."""
+    if path.suffix.lstrip(".") in FORMATS:
+        return path.suffix.lstrip(".")
+    if not args.format:
+        what = "-:" if path == STDOUT else f"'{path}': it must end in .npz, .csv or .json; otherwise"
+        args.usage_error(f"{name} is {what} choose its format with --format npz, csv or json")
+    return args.format
 
 
 def _camera(args: argparse.Namespace) -> Intrinsics | None:

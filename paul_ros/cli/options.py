@@ -10,6 +10,8 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from paul_ros.cli.output import output_path
+
 if TYPE_CHECKING:
     Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 else:
@@ -34,7 +36,7 @@ def add_json(parser: argparse.ArgumentParser, what: str = "the report") -> None:
     parser.add_argument(
         "--json",
         metavar="FILE",
-        type=Path,
+        type=output_path,
         help=f"write {what} as JSON; - prints it to standard output in place of the table",
     )
 

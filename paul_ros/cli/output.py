@@ -13,26 +13,36 @@ STDOUT = Path("-")
 """As the FILE of an option: standard output."""
 
 
+def output_path(text: str) -> Path:
+    """Parse the path of an output; /dev/stdout is standard output too."""
+    return STDOUT if text == "/dev/stdout" else Path(text)
+
+
 def check_files(outputs: Iterable[Path | None], inputs: Iterable[str | Path | None]) -> None:
     """Refuse outputs that cannot be written, or that would overwrite an input or each other, before any work is done.
 
     Raises:
         OutputError: names the file and what to do.
     """
+    from paul_ros.errors import OutputError
     from paul_ros.output_files import check_outputs
 
-    check_outputs([path for path in outputs if path != STDOUT], inputs)
+    paths = list(outputs)
+    if STDOUT in paths and sys.stdout is None:
+        raise OutputError("standard output is closed: name a file")
+    check_outputs([path for path in paths if path != STDOUT], inputs)
 
 
 def check_suffix(path: Path | None, suffixes: Collection[str]) -> None:
-    """Refuse a file, if there is one, whose name does not say its format.
+    """Refuse a file, if there is one, whose name does not say its format. Devices and pipes have any name.
 
     Raises:
         OutputError: names the suffixes.
     """
     from paul_ros.errors import OutputError
+    from paul_ros.files import is_stream
 
-    if path and path.suffix not in suffixes:
+    if path and path.suffix not in suffixes and (path == STDOUT or not is_stream(path)):
         what = "this cannot go to standard output" if path == STDOUT else f"{path}: this suffix says no format"
         raise OutputError(f"{what}; name a file that ends in {' or '.join(suffixes)}")
 
@@ -65,7 +75,7 @@ def publish(
         if draw:
             draw()
     finally:
-        print(json.dumps(report, indent=2, ensure_ascii=False) if to_stdout else table(report))
+        print(json.dumps(report, indent=2) if to_stdout else table(report))
 
 
 @contextlib.contextmanager
@@ -78,8 +88,6 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
     from paul_ros.files import atomic_file
 
     if path == STDOUT:
-        if sys.stdout is None:
-            raise OSError("standard output is closed: name a file")
         yield sys.stdout.buffer
         return
     with atomic_file(path) as file:

@@ -56,11 +56,10 @@ def run(args: argparse.Namespace) -> None:
         PaulError: bad data, recipe or file, or a missing package.
         KeyboardInterrupt: its text says what was stopped and how to go on.
     """
-    require("train", "torch", "tqdm")
     from training.options import TrainingOptions
-    from training.session import train
+    from training.preflight import prepare
 
-    results = train(
+    job = prepare(
         TrainingOptions(
             data=tuple(args.data),
             model=args.output,
@@ -79,6 +78,11 @@ def run(args: argparse.Namespace) -> None:
             command=_command(),
         )
     )
+    # After all checks, since the import takes seconds.
+    require("train", "torch", "tqdm")
+    from training.session import train
+
+    results = train(job)
     if results:
         publish(results.report, lambda _: results.text, args.json)
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -12,6 +11,7 @@ from typing import Any
 
 from paul_ros.errors import OutputError
 from paul_ros.extras import require
+from paul_ros.files import atomic_file
 from paul_ros.offline.bag_records import BagMessages, Record
 from paul_ros.output_files import check_output
 
@@ -30,13 +30,13 @@ LATCHED_QOS = (
 class BagWriter:
     """A context manager that writes one .mcap file: profile ros2, ros2msg schemas, CDR.
 
-    The bytes go to `PATH.part`, chunk by chunk. The file takes the name PATH in one step when the block ends well.
-    A block that raises leaves PATH as it was and removes the `.part` file. A killed process leaves the `.part` file,
-    which `read_messages` or `mcap recover` reads up to the last whole chunk. Equal input gives equal bytes.
+    The bytes go to `PATH.RANDOM.part`, chunk by chunk; see `atomic_file`. The file takes the name PATH in one step when
+    the block ends well. A block that raises leaves PATH as it was and removes the `.part` file. A killed process leaves
+    the `.part` file, which `read_messages` or `mcap recover` reads up to the last whole chunk. Equal input gives equal
+    bytes.
 
     Attributes:
         path: the file to write.
-        part: the file that is written meanwhile.
         count: number of messages written.
     """
 
@@ -50,7 +50,6 @@ class BagWriter:
         """
         require("bags", "mcap")
         self.path = Path(path)
-        self.part = self.path.with_name(self.path.name + ".part")
         self.count = 0
         self._compression = compression
         self._messages = messages or BagMessages()
@@ -62,11 +61,12 @@ class BagWriter:
         from mcap.writer import CompressionType, Writer
 
         check_output(self.path)
+        # Smaller than a chunk, so that each chunk reaches the system at once.
+        self._output = atomic_file(self.path, buffering=4096)
         with self._disk_errors():
-            # Smaller than a chunk, so that each chunk reaches the system at once.
-            self._file = open(self.part, "wb", buffering=4096)
+            file = self._output.__enter__()
         self._writer = Writer(
-            self._file,
+            file,
             chunk_size=_CHUNK_BYTES,
             enable_data_crcs=True,
             compression=CompressionType[self._compression.upper()],
@@ -115,17 +115,14 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                with self._disk_errors():
+        with self._disk_errors():
+            try:
+                if kind is None:
                     self._writer.finish()
-                    self._file.flush()
-                    os.fsync(self._file.fileno())
-                    os.replace(self.part, self.path)
-        finally:
-            self.part.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # on a full disk closing fails as the writing did
-                self._file.close()
+            except BaseException as failure:
+                self._output.__exit__(type(failure), failure, failure.__traceback__)
+                raise
+            self._output.__exit__(kind, error, trace)
 
     @contextlib.contextmanager
     def _disk_errors(self) -> Iterator[None]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import io
-import os
 import shutil
 import subprocess
 import tempfile
@@ -18,7 +17,7 @@ import numpy as np
 from msg_adapters.palette import SIDE_COLOURS
 from paul_ros.errors import PictureError
 from paul_ros.extras import require
-from paul_ros.files import write_atomically
+from paul_ros.files import atomic_file, write_atomically
 from paul_ros.offline.canvas import AMBER, CALM, INK
 
 PICTURES_PER_SECOND = 10
@@ -86,16 +85,15 @@ def _write_png(path: Path, pictures: Iterable[np.ndarray]) -> None:
 
 
 def _write_mp4(path: Path, pictures: Iterable[np.ndarray]) -> None:
-    """Pipe the pictures through ffmpeg into a temporary file beside the target, then rename it."""
+    """Pipe the pictures through ffmpeg into a temporary file, which it must be able to seek in, then copy that."""
     pictures = iter(pictures)
     first = next(pictures)
     height, width = first.shape[:2]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        part = Path(folder) / path.name
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
         command = ["ffmpeg", "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
         command += ["-s", f"{width}x{height}", "-r", str(PICTURES_PER_SECOND), "-i", "-", "-pix_fmt", "yuv420p"]
-        with subprocess.Popen([*command, str(part)], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        with subprocess.Popen([*command, str(film)], stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
             assert ffmpeg.stdin
             try:
                 for picture in chain([first], pictures):
@@ -103,6 +101,7 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray]) -> None:
             except BrokenPipeError:
                 pass  # ffmpeg explains on stderr why it stopped
             _, complaint = ffmpeg.communicate()
-        if ffmpeg.returncode or not part.exists():
+        if ffmpeg.returncode or not film.exists():
             raise PictureError(f"{path}: ffmpeg failed: {' '.join(complaint.decode(errors='replace').split())}")
-        os.replace(part, path)
+        with film.open("rb") as made, atomic_file(path) as file:
+            shutil.copyfileobj(made, file)

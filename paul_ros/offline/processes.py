@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,6 +13,7 @@ from typing import Any, BinaryIO
 
 from paul_ros.errors import MissingPackageError
 from paul_ros.extras import needs_ros
+from paul_ros.signals import delayed_signals, raise_signals
 
 _END_TIMEOUT = 30.0  # seconds for a process to end by itself
 _TERMINATE_TIMEOUT = 5.0  # seconds after SIGTERM until it is killed
@@ -63,7 +63,7 @@ def process(
         log: file for stderr, and for stdout unless that is given.
         stdout: another place for stdout, as for subprocess.Popen.
     """
-    with _deferred_interrupt() as interrupted:  # an interrupt in here would lose the child's id
+    with delayed_signals() as received:  # an interrupt in here would lose the child's id
         child = subprocess.Popen(
             [sys.executable, "-m", *arguments],
             env=environment,
@@ -73,8 +73,7 @@ def process(
         )
     assert child.stdin
     try:
-        if interrupted:
-            raise KeyboardInterrupt
+        raise_signals(received)
         yield child
         child.stdin.close()  # tells the player to leave
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -83,17 +82,6 @@ def process(
         with contextlib.suppress(BrokenPipeError):
             child.stdin.close()
         _end(child)
-
-
-@contextlib.contextmanager
-def _deferred_interrupt() -> Iterator[list]:
-    """Record SIGINT during the block instead of raising; the list it yields is then not empty."""
-    interrupted: list = []
-    before = signal.signal(signal.SIGINT, lambda *arguments: interrupted.append(arguments))
-    try:
-        yield interrupted
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _end(child: subprocess.Popen) -> None:

@@ -38,14 +38,15 @@ from training.loading import load_training_data
 from training.progress import Progress, progress_bar
 from training.recipe import Recipe
 from training.reconstruction import Reconstruction
-from training.start.kept_start import START, start_identity
+from training.run_folder import START, locked, restarts, run_folder
+from training.start.kept_start import start_identity
 
 Item = TypeVar("Item")
 
 RECIPES = {"paul": "nrsfm"}
 """Method -> recipe, for methods that are not named like their recipe."""
 
-_STARTS = "starts"
+_STARTS, _RUN, _KEPT = "starts", "run", "shapes.npz"
 
 BAD_BASIN = 3.0
 """Threshold of a bad basin: its NE with one flip for all, over the median of its method's experiments."""
@@ -79,8 +80,8 @@ class Experiment:
         """
         name = RECIPES.get(self.method, self.method)
         try:
-            restarts = Recipe.load(name, list(self.settings)).restarts
-            return Recipe.load(name, [*self.settings, f"seed={self.seed * restarts}"])
+            runs = Recipe.load(name, list(self.settings)).restarts
+            return Recipe.load(name, [*self.settings, f"seed={self.seed * runs}"])
         except RecipeError as error:
             raise RecipeError(f"method {self.method}: {error}") from None
 
@@ -141,7 +142,8 @@ def perform(experiments: list[Experiment], options: SeriesOptions) -> list[Outco
     Raises:
         RecipeError: a recipe or a setting is wrong; raised before any training.
         DataError: a sequence cannot be trained on; raised before any training.
-        TrainingError: an experiment failed.
+        TrainingError: an experiment failed, or another process trains it now.
+        KeyboardInterrupt: its text says how to go on.
     """
     for experiment in experiments:
         _check(experiment)
@@ -156,7 +158,11 @@ def perform(experiments: list[Experiment], options: SeriesOptions) -> list[Outco
             detail = f" {experiment.detail}" if experiment.detail else ""
             name = f"{experiment.sequence.name} {Path(experiment.method).stem}{detail}"
             bar.set_description_str(f"{name} seed {experiment.seed}")
-            outcomes.append(_perform(experiment, folder, options.fresh, lambda done: _move(bar, number + done)))
+            try:
+                outcomes.append(_perform(experiment, folder, options.fresh, lambda done: _move(bar, number + done)))
+            except KeyboardInterrupt:
+                done = f"stopped after {number} of {len(experiments)} runs"
+                raise KeyboardInterrupt(f"{done}: the same command, without --fresh, continues") from None
             _move(bar, number + 1)
     return outcomes
 
@@ -179,28 +185,35 @@ def _move(bar: tqdm, to: float) -> None:
 
 def _perform(experiment: Experiment, folder: Path, fresh: bool, progress: Progress) -> Outcome:
     """Train an experiment unless its reconstruction is kept, and judge it."""
-    kept = folder / "shapes.npz"
-    if fresh:
-        shutil.rmtree(folder, ignore_errors=True)
-    if not kept.exists():
-        data, recipe = _training_data(experiment, folder), experiment.recipe()
-        starts = _start_files(data, recipe, folder)
-        for shared, own in starts:
-            _copy_if_missing(shared, own)
-        found = reconstruction.reconstruct(data, recipe, folder / "run", progress)
-        for shared, own in starts:
-            _copy_if_missing(own, shared)
-        found.save(kept)
+    kept = folder / _KEPT
+    if fresh or not kept.exists():
+        with locked(folder):
+            if fresh:  # the folder itself stays, since it is locked
+                kept.unlink(missing_ok=True)
+                shutil.rmtree(folder / _RUN, ignore_errors=True)
+            _train(experiment, folder, progress)
     return _judge(experiment, reconstruction.load_reconstruction(kept))
+
+
+def _train(experiment: Experiment, folder: Path, progress: Progress) -> None:
+    """Train an experiment, or continue it, and keep its reconstruction."""
+    data, recipe = _training_data(experiment, folder), experiment.recipe()
+    starts = _start_files(data, recipe, folder)
+    for shared, own in starts:
+        _copy_if_missing(shared, own)
+    found = reconstruction.reconstruct(data, recipe, folder / _RUN, progress)
+    for shared, own in starts:
+        _copy_if_missing(own, shared)
+    found.save(folder / _KEPT)
 
 
 def _start_files(data: TrainingData, recipe: Recipe, folder: Path) -> list[tuple[Path, Path]]:
     """Return the shared and the own file of each of an experiment's starts."""
     pairs = []
-    for one in reconstruction.restarts(recipe) if recipe.start != "random" else ():
+    for one in restarts(recipe) if recipe.start != "random" else ():
         identity = json.dumps([__version__, start_identity(data, one)], sort_keys=True)
         shared = folder.parent / _STARTS / f"{hashlib.sha256(identity.encode()).hexdigest()[:16]}.npz"
-        pairs.append((shared, reconstruction.run_folder(folder / "run", recipe, one.seed) / START))
+        pairs.append((shared, run_folder(folder / _RUN, recipe, one.seed) / START))
     return pairs
 
 

@@ -17,9 +17,8 @@ from training.data import TrainingData
 from training.distributed import from_first
 from training.errors import StartError
 from training.recipe import Recipe
+from training.run_folder import START
 from training.start.start import Start
-
-START = "start.npz"
 
 
 def start_identity(data: TrainingData, recipe: Recipe) -> dict[str, str | int]:
