@@ -330,11 +330,11 @@ def _unknown(name: str) -> str:
 
 def _read_yaml(path: Path) -> object:
     try:
+        if not path.is_file():  # to read a device or a pipe might never end
+            raise LayoutError("not a file" if path.exists() else "no such file")
         if path.stat().st_size > _MAX_BYTES:
             raise LayoutError(f"{path.stat().st_size} bytes; a layout has at most {_MAX_BYTES}")
         return yaml.safe_load(path.read_bytes())
-    except FileNotFoundError:
-        raise LayoutError("no such file") from None
     except OSError as error:
         raise LayoutError(error.strerror or str(error)) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

@@ -54,7 +54,7 @@ class LifterNode(LifecycleNode):
         self._values = declare(self)
         self._unknown = unknown_at_start(self)
         if self._unknown:
-            self.get_logger().warning(f"Ignored, because the node has no such parameter: {'; '.join(self._unknown)}.")
+            self.get_logger().warning(f"Unknown parameters are ignored: {'; '.join(self._unknown)}.")
         self._pipeline: Pipeline | None = None
         self._refusal: Exception | None = None
         self._starting = False

@@ -26,11 +26,8 @@ INPUTS = ("keypoints", "camera_info", "depth")
 OTHER_OUTPUTS = ("~/layout", "/diagnostics")
 """Topics that the node publishes, beside those of `paul_ros.stream.messages.OUTPUTS`."""
 
-RCLPY_REFUSALS = (ParameterException, InvalidQosOverridesError, ValueError, RuntimeError)
-"""Errors that rclpy raises for parameters and QoS overrides that it cannot use. They have no common base."""
-
-REFUSALS = (PaulError, *RCLPY_REFUSALS)
-"""Errors that refuse the value of a parameter."""
+REFUSALS = (PaulError, ParameterException, InvalidQosOverridesError, ValueError, RuntimeError)
+"""Errors that refuse the value of a parameter. Those that rclpy raises have no common base."""
 
 _LONGEST_TEXT = 1000
 _LONGEST_NAME = 200

@@ -146,7 +146,7 @@ def _allowed_only(callback: Callback, node: LifecycleNode, log: ThrottledLog) ->
         name = label or _TRANSITIONS.get(number, "")
         known = name if name in _TRANSITIONS.values() else ""
         state, autostart = lifecycle_state(node), node.get_parameter("autostart").value
-        log(f"transition {known or number}", _refusal(name, number, state, allowed, autostart))
+        log(f"{state}: transition {known or number}", _refusal(name, number, state, allowed, autostart))
         response.success = False
         return response
 
