@@ -293,7 +293,9 @@ def test_an_integer_for_a_floating_point_number(asker, start_asker):
     assert "INTEGER" in text and "DOUBLE" in text
     assert all(asker.set(given("max_persons", 1, bool_value=True), given("smoothing", 1, bool_value=True)))
     assert asker.set(given("person_height", 2, integer_value=0)) == [""]
-    started = start_asker("-p", "smoothing:=1", "-p", "person_height:=2", "-p", "min_confidence:=0", "-p", "smothing:=1")
+    started = start_asker(
+        "-p", "smoothing:=1", "-p", "person_height:=2", "-p", "min_confidence:=0", "-p", "smothing:=1"
+    )
     assert [started.value(name).double_value for name in ("smoothing", "person_height", "min_confidence")] == [1, 2, 0]
     started.healthy()
     assert started.layout()["smoothing_hz"] == 1.0
@@ -322,6 +324,8 @@ def test_an_unknown_name_is_refused_with_the_nearest(asker):
     assert text == "there is no parameter 'smothing', did you mean 'smoothing'?"
     assert asker.set_all(given("modle", 4, string_value="x")) == "there is no parameter 'modle', did you mean 'model'?"
     assert asker.set(given("zzzz", 4)) == ["there is no parameter 'zzzz'"]
+    (text,) = asker.set(given("qos_overrides./new.subscription.depth", 2, integer_value=5))
+    assert text.endswith("'; the QoS of a topic can be set only at start")
 
 
 def test_a_huge_text_and_a_text_with_odd_letters(asker):

@@ -22,6 +22,7 @@ from paul_ros.ros.node_parameters import REFUSALS, acceptable, declare, one_line
 from paul_ros.ros.pipeline import Pipeline
 from paul_ros.ros.rclpy_internals import destroy_lifecycle_publishers, lifecycle_state
 from paul_ros.ros.services import guard_services
+from paul_ros.stream.advice import sentence
 from paul_ros.stream.parameters import LIVE
 from paul_ros.stream.stream import LiftStream, open_stream
 
@@ -30,14 +31,14 @@ _SWITCHING = ("model", "layout", "output_layout")
 
 
 def _logged(callback: Callable[[Any, LifecycleState], TransitionCallbackReturn]) -> Callable:
-    """Log an exception in a transition; rclpy swallows it."""
+    """Report an error in a transition; rclpy swallows it."""
 
     @functools.wraps(callback)
     def guarded(self: LifterNode, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             return callback(self, state)
         except Exception as error:
-            self.get_logger().error(f"{callback.__name__.removeprefix('on_')}: {type(error).__name__}: {error}")
+            self.report_fault(f"the transition {callback.__name__.removeprefix('on_')}", error)
             return TransitionCallbackReturn.ERROR
 
     return guarded
@@ -54,7 +55,7 @@ class LifterNode(LifecycleNode):
         self._values = declare(self)
         self._unknown = unknown_at_start(self)
         if self._unknown:
-            self.get_logger().warning(f"Unknown parameters are ignored: {'; '.join(self._unknown)}.")
+            self.get_logger().warning(sentence(f"Unknown parameters are ignored: {'; '.join(self._unknown)}"))
         self._pipeline: Pipeline | None = None
         self._refusal: Exception | None = None
         self._starting = False

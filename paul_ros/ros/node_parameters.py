@@ -29,6 +29,7 @@ OTHER_OUTPUTS = ("~/layout", "/diagnostics")
 REFUSALS = (PaulError, ParameterException, InvalidQosOverridesError, ValueError, RuntimeError)
 """Errors that refuse the value of a parameter. Those that rclpy raises have no common base."""
 
+_QOS = "qos_overrides."
 _LONGEST_TEXT = 1000
 _LONGEST_NAME = 200
 
@@ -37,7 +38,8 @@ class UnknownParameterError(ParameterNotDeclaredException):
     """A parameter is not the node's. rclpy's own services turn this error into a refusal with its text."""
 
     def __init__(self, name: str, names: Iterable[str]) -> None:
-        Exception.__init__(self, f"there is no parameter {_unknown(name, names)}")
+        fixed = "; the QoS of a topic can be set only at start" if name.startswith(_QOS) else ""
+        Exception.__init__(self, f"there is no parameter {_unknown(name, names)}{fixed}")
 
 
 def declare(node: Node) -> dict[str, Any]:
@@ -72,7 +74,8 @@ def acceptable(node: Node, parameters: list[GivenParameter]) -> list[GivenParame
     """
     for given in parameters:
         if not node.has_parameter(given.name):
-            raise UnknownParameterError(given.name, node.list_parameters([], 0).names)
+            names = node.list_parameters([], 0).names
+            raise UnknownParameterError(given.name, [name for name in names if not name.startswith(_QOS)])
     return [_in_declared_type(given) for given in parameters]
 
 
@@ -104,7 +107,7 @@ def _qos_overrides(node: Node) -> list[str]:
     published = [*(output.topic for output in OUTPUTS.values()), *OTHER_OUTPUTS]
     sides = [*((topic, "subscription") for topic in INPUTS), *((topic, "publisher") for topic in published)]
     return [
-        f"qos_overrides.{node.resolve_topic_name(topic)}.{side}.{policy.name.lower()}"
+        f"{_QOS}{node.resolve_topic_name(topic)}.{side}.{policy.name.lower()}"
         for topic, side in sides
         for policy in OVERRIDES.policy_kinds
     ]
