@@ -32,7 +32,7 @@ from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.stream.stream import LiftStream
 
-CASES = {"fields": 200, "junk": 100, "cdr": 200, "bags": 25, "models": 50, "layouts": 50}
+CASES = {"fields": 200, "junk": 100, "cdr": 200, "bags": 25, "models": 50, "layouts": 50, "services": 100}
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,9 @@ def quiet():
 
 
 @pytest.mark.parametrize("kind", CASES)
-def test_nothing_crashes_and_no_frame_is_lost_uncounted(kind):
+def test_nothing_crashes_and_no_frame_is_lost_uncounted(kind, request):
+    if kind == "services":
+        request.getfixturevalue("ros")
     report = command.fuzz(CASES[kind], seed=11, kinds=(kind,))
     assert report["cases"] == CASES[kind]
     row = report["kinds"][kind]
@@ -87,6 +89,16 @@ def test_an_adapter_that_fails_would_be_noticed(monkeypatch):
     assert not command.fuzz(50, kinds=("junk",))["crashes"]
     monkeypatch.setattr(msg_adapters, "SUPPORTED", failing(raises(MessageError("no", "advice"))))
     assert not command.fuzz(50, kinds=("fields",))["crashes"]
+
+
+def test_a_service_that_raises_would_be_noticed(ros, monkeypatch):
+    monkeypatch.setattr("paul_ros.ros.node.guard_services", lambda *_: None)
+    assert command.fuzz(100, kinds=("services",))["crashes"]
+
+
+def test_a_node_that_no_longer_lifts_would_be_noticed(ros, monkeypatch):
+    monkeypatch.setattr("paul_ros.ros.pipeline.Pipeline.on_keypoints", lambda *_: None)
+    assert command.fuzz(25, kinds=("services",))["crashes"]
 
 
 def test_a_message_that_vanishes_would_be_noticed(monkeypatch):

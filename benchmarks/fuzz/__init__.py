@@ -3,7 +3,8 @@
 
     python -m benchmarks.fuzz [--cases 100000] [--seed 0] [--only KIND] [--json fuzz.json]
 
-A case is one message, serialised message, bag, model file or layout.  It is made whole and then broken in a few places:
+A case is one message, serialised message, bag, model file, layout or request.  It is made whole and then broken in a
+few places:
 
 - fields: messages of every supported type.  Every field keeps its type, with NaN, infinite, huge or negative values,
   odd lengths and odd text.  Even a drop as `internal_error` is a crash here.
@@ -12,6 +13,8 @@ A case is one message, serialised message, bag, model file or layout.  It is mad
 - bags: bits flipped, bytes cut off, inserted and exchanged, and intact bags of broken messages; read and replayed.
 - models: the file, or its contents under a correct checksum.
 - layouts: the YAML text, or the values in it.
+- services: requests to the services of a node.  Each must be answered as the node's state and the values demand, and
+  the node must lift the next frame.
 
 A crash is an exception that the documentation does not promise, a warning of NumPy, or an output that is not finite.
 A message is lost uncounted if it becomes neither a frame, nor a part of one, nor a drop.

@@ -21,6 +21,7 @@ import msg_adapters
 from benchmarks.fuzz.bench import Bench, model_file, sealed
 from benchmarks.fuzz.breaking import break_array, break_bytes, break_fields, break_json, break_types
 from benchmarks.fuzz.messages import BODIES, BUILDERS, camera_info, cloud, depth_image, header, random_pose
+from benchmarks.fuzz.services import service_session
 from benchmarks.fuzz.tally import Tally, WrongOutput, persons_in
 from msg_adapters import MessageError
 from msg_adapters.cdr import CloudReader
@@ -339,6 +340,7 @@ SESSIONS: dict[str, Session] = {
     "bags": bag_session,
     "models": model_session,
     "layouts": layout_session,
+    "services": service_session,
 }
 """Kind -> session."""
 
