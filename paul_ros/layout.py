@@ -271,7 +271,7 @@ def load_layout(name_or_path: str | os.PathLike[str]) -> Layout:
     name = str(name_or_path)
     if name in layout_names():
         return _shipped(name)
-    if anonymous := re.fullmatch(r"points(\d{1,6})", name):
+    if anonymous := re.fullmatch(r"points(\d{1,5})", name):
         return anonymous_layout(int(anonymous[1]))
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml") and len(path.parts) < 2:

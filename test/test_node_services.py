@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import time
 
 import pytest
@@ -328,8 +329,23 @@ def test_an_unknown_name_is_refused_with_the_nearest(asker):
     assert text.endswith("'; the QoS of a topic can be set only at start")
 
 
-def test_a_huge_text_and_a_text_with_odd_letters(asker):
-    for text in ("m" * 10**6, "\n", " ", "猫.npz", "/dev/zero", "/dev/stdin", "/", ".", "/proc/self/mem", "%s%n{}"):
+def test_texts_that_name_no_file(asker, tmp_path):
+    """To read a device or a pipe would never end."""
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for text in (
+        str(tmp_path / "pipe.yaml"),
+        "m" * 10**6,
+        "\n",
+        " ",
+        "猫.npz",
+        "/dev/zero",
+        "/dev/stdin",
+        "/",
+        ".",
+        "/proc/self/mem",
+        "%s%n{}",
+        "points999999",
+    ):
         for name in ("model", "layout", "output_layout"):
             (reason,) = asker.set(given(name, 4, string_value=text))
             assert 5 < len(reason) < 2000, (name, text)

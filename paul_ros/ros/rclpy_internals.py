@@ -83,8 +83,9 @@ class OneThreadExecutor(SingleThreadedExecutor):
 
 
 def _name_of(entity: Any) -> str:
-    """Return a name of what an executor waits for, such as 'the subscription of /keypoints'."""
-    for attribute, text in (("service_name", "the service"), ("topic_name", "the subscription of")):
+    """Return a name of what an executor waits for, such as 'the subscription of camera_info'."""
+    # Not `service_name` and `topic_name`, which raise for what was destroyed meanwhile.
+    for attribute, text in (("srv_name", "the service"), ("topic", "the subscription of")):
         if name := getattr(entity, attribute, None):
             return f"{text} {name}"
     # Timers have no names; their callbacks do.
