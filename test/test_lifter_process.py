@@ -137,6 +137,23 @@ def test_a_service_that_raises_refuses(ros, spun, monkeypatch, capfd, name):
     monkeypatch.undo()
 
 
+def test_a_guard_that_raises_refuses_too(ros, spun, monkeypatch):
+    monkeypatch.setattr("paul_ros.ros.services.allowed_transitions", lambda _: 1 / 0)
+    monkeypatch.setattr("paul_ros.ros.services._too_many", lambda _: 1 / 0)
+    node, other = spun
+    services = {service.srv_name.rpartition("/")[2]: service for service in node.services}
+    for name, count in (("change_state", 0), ("set_parameters", 3), ("set_parameters_atomically", 3)):
+        kind = services[name].srv_type
+        request = kind.Request()
+        if count:
+            request.parameters = [node.get_parameter("smoothing").to_parameter_msg()] * count
+        answer = services[name].callback(request, kind.Response())
+        text = str(answer)
+        assert "internal error" in text or not answer.success
+        assert len(getattr(answer, "results", range(count))) == count
+    assert faults(node) == 3
+
+
 def test_a_clock_before_the_epoch(ros, spun):
     """rclpy's time source raises ValueError for it."""
     from rclpy.parameter import Parameter

@@ -2,11 +2,12 @@
 """Guards of the node's own services: every request gets an answer, and none ends the process.
 
 rclpy brings these services: `change_state` and its relatives, those of parameters, and `get_type_description`. In
-rclpy 7.1 some requests raise an error inside them, which would leave `spin` (https://github.com/ros2/rclpy/issues/1209).
+rclpy 7.1 some requests raise an error inside them, which leaves `spin` (https://github.com/ros2/rclpy/issues/1209).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -49,14 +50,15 @@ def guard_services(node: LifecycleNode, log: ThrottledLog, on_fault: FaultReport
         on_fault: called with every error that a service raises.
     """
     for service in node.services:
-        callback = _answering(service.callback, service.service_name, on_fault)
+        answering = functools.partial(_answering, name=service.service_name, on_fault=on_fault)
+        callback = service.callback
         if service.srv_type is ChangeState:
             callback = _allowed_only(callback, node, log)
         elif service.srv_type is SetParameters:
-            callback = _one_by_one(callback)
+            callback = _one_by_one(_readable_only(answering(callback)))
         elif service.srv_type is SetParametersAtomically:
             callback = _readable_only(callback)
-        service.callback = callback
+        service.callback = answering(callback)
 
 
 def _answering(callback: Callback, name: str, on_fault: FaultReport) -> Callback:
@@ -68,17 +70,18 @@ def _answering(callback: Callback, name: str, on_fault: FaultReport) -> Callback
         except Exception as error:
             on_fault(f"the service {name}", error)
             # A new response: the error may have left the given one half filled.
-            return _refused(type(response)(), f"internal error, see the node's log: {one_line(error)}")
+            return _refused(request, type(response)(), f"internal error, see the node's log: {one_line(error)}")
 
     return answer
 
 
-def _refused(response: Any, reason: str) -> Any:
-    """Fill an empty response with a refusal; the types without a field for it stay empty, as is the custom of ROS."""
+def _refused(request: Any, response: Any, reason: str) -> Any:
+    """Fill an empty response with a refusal; types without a field for it stay empty, as in all nodes of rclpy."""
+    refusal = SetParametersResult(successful=False, reason=reason)
     if isinstance(response, SetParameters.Response):
-        response.results = [SetParametersResult(successful=False, reason=reason)]
+        response.results = [refusal] * len(request.parameters)
     elif isinstance(response, SetParametersAtomically.Response):
-        response.result = SetParametersResult(successful=False, reason=reason)
+        response.result = refusal
     elif isinstance(response, GetTypeDescription.Response):
         response.failure_reason = reason
     return response
@@ -89,15 +92,12 @@ def _refused(response: Any, reason: str) -> Any:
 
 def _one_by_one(callback: Callback) -> Callback:
     """Let each parameter of a request be accepted or refused on its own."""
-    readable = _readable_only(callback)
 
     def answer(request: SetParameters.Request, response: SetParameters.Response) -> SetParameters.Response:
         if reason := _too_many(request.parameters):
-            refusal = SetParametersResult(successful=False, reason=reason)
-            response.results = [refusal] * len(request.parameters)
-        else:
-            singles = (SetParameters.Request(parameters=[parameter]) for parameter in request.parameters)
-            response.results = [readable(single, SetParameters.Response()).results[0] for single in singles]
+            return _refused(request, response, reason)
+        singles = (SetParameters.Request(parameters=[parameter]) for parameter in request.parameters)
+        response.results = [callback(single, SetParameters.Response()).results[0] for single in singles]
         return response
 
     return answer
@@ -108,7 +108,7 @@ def _readable_only(callback: Callback) -> Callback:
 
     def answer(request: Any, response: Any) -> Any:
         reason = _too_many(request.parameters) or _unknown_type(request.parameters)
-        return _refused(response, reason) if reason else callback(request, response)
+        return _refused(request, response, reason) if reason else callback(request, response)
 
     return answer
 
