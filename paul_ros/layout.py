@@ -271,7 +271,7 @@ def load_layout(name_or_path: str | os.PathLike[str]) -> Layout:
     name = str(name_or_path)
     if name in layout_names():
         return _shipped(name)
-    if anonymous := re.fullmatch(r"points(\d{1,6})", name):
+    if anonymous := re.fullmatch(r"points(\d{1,5})", name):
         return anonymous_layout(int(anonymous[1]))
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml") and len(path.parts) < 2:
@@ -330,11 +330,11 @@ def _unknown(name: str) -> str:
 
 def _read_yaml(path: Path) -> object:
     try:
+        if not path.is_file():  # to read a device or a pipe might never end
+            raise LayoutError("not a file" if path.exists() else "no such file")
         if path.stat().st_size > _MAX_BYTES:
             raise LayoutError(f"{path.stat().st_size} bytes; a layout has at most {_MAX_BYTES}")
         return yaml.safe_load(path.read_bytes())
-    except FileNotFoundError:
-        raise LayoutError("no such file") from None
     except OSError as error:
         raise LayoutError(error.strerror or str(error)) from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:

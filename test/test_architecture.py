@@ -35,7 +35,9 @@ ALLOWED = {
 }
 ROS = {
     "rclpy",
+    "lifecycle_msgs",
     "rcl_interfaces",
+    "type_description_interfaces",
     "builtin_interfaces",
     "diagnostic_msgs",
     "geometry_msgs",

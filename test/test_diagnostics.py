@@ -73,6 +73,24 @@ def test_a_fault_of_the_node_is_an_error(health, stream):
     assert health.report(102.0, stream).level == OK
 
 
+def test_a_callback_that_failed_is_an_error_once(health, stream):
+    run(health)
+    stream.ledger.note("callback_failed")
+    report = health.report(101.0, stream)
+    assert (report.level, report.values["noted_callback_failed"]) == (ERROR, 1) and "see its log" in report.message
+    run(health, 102.0)
+    assert health.report(102.0, stream).level == OK
+
+
+def test_an_unknown_parameter_is_a_value_and_no_warning(health, stream):
+    run(health)
+    stream.ledger.note("unknown_parameter", count=2)
+    health = Health(100.0, notes=stream.ledger.notes)
+    run(health)
+    report = health.report(101.0, stream)
+    assert (report.level, report.values["noted_unknown_parameter"]) == (OK, 2)
+
+
 def test_drops_are_a_warning_and_an_error_where_nothing_is_left(health, stream):
     run(health)
     health.received(100.9)

@@ -101,7 +101,7 @@ def test_a_subscriber_whose_qos_does_not_match_is_named_and_the_override_helps(s
         bench.lifter.stop()
 
 
-@pytest.mark.parametrize("value", ["sometimes", "-5"])
+@pytest.mark.parametrize("value", ["sometimes", "-5", "99999999999"])
 def test_an_override_that_cannot_be_is_refused(start_lifter, model_file, value):
     policy = "reliability" if value == "sometimes" else "depth"
     lifter = start_lifter(

@@ -225,7 +225,7 @@ def test_package_xml_is_valid_and_says_what_the_code_needs() -> None:
     assert {f"python3-{name.lower().removeprefix('py')}" for name in required} <= needed
     node = "".join(file.read_text(encoding="utf-8") for file in sorted((ROOT / "paul_ros/ros").glob("*.py")))
     writers = (ROOT / "msg_adapters/outputs.py").read_text(encoding="utf-8")
-    imported = set(re.findall(r"^from (\w+)\.msg import", node, re.MULTILINE))
+    imported = set(re.findall(r"^from (\w+)\.(?:msg|srv) import", node, re.MULTILINE))
     made = set(re.findall(r'"(\w+)/msg/', writers))
     assert "rcl_interfaces" in imported and "builtin_interfaces" in made
     # Foxglove's messages are useful only beside Foxglove, which brings them.

@@ -37,7 +37,7 @@ def test_topics_are_opened_and_closed_as_ids_come_and_go(body_topics, log):
     assert sorted(log) == [("close", topic("b2")), ("close", topic("c"))] and body_topics.topics == []
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "../x", "1st", "a b", "ä", "a\n", "{}", "~"])
+@pytest.mark.parametrize("name", ["", "a/b", "../x", "1st", "a b", "ä", "a\n", "{}", "~", "a" * 300])
 def test_an_id_that_no_topic_can_have_is_returned(body_topics, log, name):
     assert body_topics.update(["anna", name], 10) == [name]
     assert log == [("open", topic("anna"))]

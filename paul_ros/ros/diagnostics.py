@@ -113,6 +113,9 @@ class Health:
     def _level(self, drops: Counter, silence: float | None, problem: str, stream: LiftStream) -> tuple[int, str]:
         if problem:
             return ERROR, problem
+        notes = Counter(stream.ledger.notes) - self._old_notes
+        if notes["callback_failed"]:
+            return ERROR, "a callback of this node failed, see its log"
         if drops["internal_error"]:
             return ERROR, f"a fault of this node, see its log; dropped: {listed(drops)}"
         if self._messages and not self._frames and _dropped_messages(drops) >= self._messages:

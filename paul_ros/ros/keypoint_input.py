@@ -14,7 +14,7 @@ from paul_ros.errors import ParameterError
 from paul_ros.ros.advisor import ThrottledLog
 from paul_ros.ros.lost_messages import PublicationNumbers
 from paul_ros.ros.messages import message_class
-from paul_ros.ros.node_parameters import RCLPY_REFUSALS
+from paul_ros.ros.node_parameters import one_line
 from paul_ros.ros.qos import OVERRIDES, input_qos, subscription_events
 from paul_ros.ros.ros4hri import BODY, LIST, BodyTopics
 
@@ -23,6 +23,9 @@ AUTO = "auto"
 
 _SERIALISED = "sensor_msgs/msg/PointCloud2"
 """Type whose serialised bytes the stream reads: rclpy's objects would cost more than lifting."""
+
+_ID_CHARS = 50
+"""Characters of an id in a warning."""
 
 
 def readable() -> list[str]:
@@ -154,8 +157,8 @@ class KeypointInput:
                 "source its workspace.",
             )
             return
-        except RCLPY_REFUSALS as error:
-            self._report("impossible", f"{self.topic} cannot be subscribed: {error}")
+        except Exception as error:  # rclpy, QoS overrides and message packages raise errors of a dozen kinds
+            self._report("impossible", f"{self.topic} cannot be subscribed: {one_line(error)}")
             return
         self.type_name, self.problem = type_name, ""
         self._node.get_logger().info(f"Reading {type_name} from {self.topic}.")
@@ -176,7 +179,7 @@ class KeypointInput:
         if not msg.ids:
             self._listener.on_no_bodies()
         if ignored := self._bodies.update(msg.ids, self._listener.max_bodies()):
-            names = ", ".join(map(repr, ignored[:5]))
+            names = ", ".join(repr(name[:_ID_CHARS]) for name in ignored[:5])
             self._warn(
                 "bodies",
                 f"Bodies that are not read, by their ids: {names}. Raise `max_persons`, or publish ids that a topic's "

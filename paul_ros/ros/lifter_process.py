@@ -30,11 +30,12 @@ import time
 
 import rclpy
 from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from paul_ros.ros.node import LifterNode, one_line
-from paul_ros.ros.node_parameters import REFUSALS
+from paul_ros.ros.node import LifterNode
+from paul_ros.ros.node_parameters import REFUSALS, one_line
 from paul_ros.ros.rclpy_internals import OneThreadExecutor
 from paul_ros.stream.parameters import as_text
 
@@ -42,6 +43,9 @@ _HELP_COLUMNS = 80
 
 _STOP_SECONDS = 0.2
 """Interval in which an idle node checks for a signal to end."""
+
+_FAULT_SECONDS = 0.01
+"""Pause after an error of a callback."""
 
 
 def main() -> int:
@@ -69,13 +73,24 @@ def main() -> int:
 
 
 def spin(node: LifterNode, stop: threading.Event) -> None:
-    """Run the node's callbacks until `stop` is set."""
-    executor = OneThreadExecutor()
+    """Run the node's callbacks until `stop` is set; an error of a callback is reported, and the node goes on."""
+
+    def report(where: str, error: Exception) -> None:
+        node.report_fault(where, error)
+        # A callback that fails at once again and again must not take the whole CPU.
+        stop.wait(_FAULT_SECONDS)
+
+    executor = OneThreadExecutor(report)
     executor.add_node(node)
     # A timer of the node's, not a timeout of spin_once: that would make and destroy a timer each time.
     node.create_timer(_STOP_SECONDS, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
     while rclpy.ok() and not stop.is_set():
-        executor.spin_once()
+        try:
+            executor.spin_once()
+        except ExternalShutdownException:
+            return
+        except Exception as error:
+            report("the event loop", error)
 
 
 def _init_ros(argv: list[str]) -> None:

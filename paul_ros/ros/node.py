@@ -8,7 +8,7 @@ It subscribes to `keypoints` (2D), `camera_info` and `depth` (both optional). It
 from __future__ import annotations
 
 import functools
-import re
+import traceback
 from collections.abc import Callable, Iterable
 from typing import Any, cast
 
@@ -16,11 +16,13 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from paul_ros.ros.advisor import ThrottledLog
+from paul_ros.ros.advisor import NOTE_SECONDS, ThrottledLog
 from paul_ros.ros.diagnostics import summary
-from paul_ros.ros.node_parameters import REFUSALS, declare
+from paul_ros.ros.node_parameters import REFUSALS, acceptable, declare, one_line, unknown_at_start
 from paul_ros.ros.pipeline import Pipeline
 from paul_ros.ros.rclpy_internals import destroy_lifecycle_publishers, lifecycle_state
+from paul_ros.ros.services import guard_services
+from paul_ros.stream.advice import sentence
 from paul_ros.stream.parameters import LIVE
 from paul_ros.stream.stream import LiftStream, open_stream
 
@@ -29,14 +31,14 @@ _SWITCHING = ("model", "layout", "output_layout")
 
 
 def _logged(callback: Callable[[Any, LifecycleState], TransitionCallbackReturn]) -> Callable:
-    """Log an exception in a transition; rclpy swallows it."""
+    """Report an error in a transition; rclpy swallows it."""
 
     @functools.wraps(callback)
     def guarded(self: LifterNode, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             return callback(self, state)
         except Exception as error:
-            self.get_logger().error(f"{callback.__name__.removeprefix('on_')}: {type(error).__name__}: {error}")
+            self.report_fault(f"the transition {callback.__name__.removeprefix('on_')}", error)
             return TransitionCallbackReturn.ERROR
 
     return guarded
@@ -49,12 +51,18 @@ class LifterNode(LifecycleNode):
         """Declare the parameters; raises one of REFUSALS for a value of the wrong type or out of range."""
         super().__init__("lifter")
         self._log = ThrottledLog(self.get_logger().warning)
+        self._fault_log = ThrottledLog(self.get_logger().error)
         self._values = declare(self)
+        self._unknown = unknown_at_start(self)
+        if self._unknown:
+            self.get_logger().warning(sentence(f"Unknown parameters are ignored: {'; '.join(self._unknown)}"))
         self._pipeline: Pipeline | None = None
         self._refusal: Exception | None = None
         self._starting = False
         self._final_summary = "nothing was lifted"
+        self.add_pre_set_parameters_callback(functools.partial(acceptable, self))
         self.add_on_set_parameters_callback(self._set_parameters)
+        guard_services(self, self._log, self.report_fault)
 
     @property
     def pipeline(self) -> Pipeline:
@@ -90,6 +98,19 @@ class LifterNode(LifecycleNode):
         """Return in one line what was done."""
         return f"lifter: {summary(self.stream) if self._pipeline else self._final_summary}"
 
+    def report_fault(self, where: str, error: Exception) -> None:
+        """Log and count an error that no input and no request may raise; /diagnostics is ERROR then.
+
+        Args:
+            where: name of the callback that raised it, such as 'the service /lifter/get_state'.
+            error: what it raised.
+        """
+        trace = "".join(traceback.format_exception(error))
+        text = f"Fault in {where}; the node goes on. Report it with this text.\n{trace}"
+        self._fault_log(f"{where} {type(error).__name__}", text, NOTE_SECONDS)
+        if self._pipeline:
+            self.stream.ledger.note("callback_failed")
+
     # --- transitions
 
     @_logged
@@ -100,6 +121,7 @@ class LifterNode(LifecycleNode):
         except REFUSALS as error:
             self._clean_up()
             return self._refuse(error)
+        self.stream.ledger.note("unknown_parameter", count=len(self._unknown))
         return TransitionCallbackReturn.SUCCESS
 
     @_logged
@@ -176,8 +198,3 @@ class LifterNode(LifecycleNode):
                 setattr(pipeline.stream, name, given[name])
         if pipeline.active:
             pipeline.publish_layout()
-
-
-def one_line(error: BaseException) -> str:
-    """Return an error's text without line breaks and without the places in rcl's own source that it names."""
-    return re.sub(r",? at \S+\.c(pp)?:\d+", "", " ".join(str(error).split()))

@@ -15,9 +15,14 @@ WarnOfTopic = Callable[[str, str], None]
 """Takes the name of a topic and a warning about it."""
 
 
+_MAX_DEPTH = 2**31 - 1
+
+
 def _validated(qos: QoSProfile) -> SetParametersResult:
-    """Reject a negative depth: rclpy checks all but this, which would end in a TypeError of its bindings."""
-    return SetParametersResult(successful=qos.depth >= 0, reason=f"depth is {qos.depth}; it must not be negative")
+    """Reject a depth that is no 32-bit number: rclpy checks all but this, and its bindings would raise TypeError."""
+    return SetParametersResult(
+        successful=0 <= qos.depth <= _MAX_DEPTH, reason=f"depth is {qos.depth}; it must be 0 to {_MAX_DEPTH}"
+    )
 
 
 OVERRIDES = QoSOverridingOptions(

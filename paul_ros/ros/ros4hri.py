@@ -19,6 +19,7 @@ BODY = "hri_msgs/msg/Skeleton2D"
 
 # A token of a topic's name does not begin with a digit (design.ros2.org, Topic and Service Names).
 _ID = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_MAX_TOPIC = 247  # characters, in ROS's middleware
 
 
 class BodyTopics:
@@ -48,13 +49,16 @@ class BodyTopics:
             The ids that cannot be followed: no topic can have their name, or they exceed the limit.
         """
         names = list(dict.fromkeys(ids))
-        possible = [name for name in names if _ID.fullmatch(name)][:limit]
-        wanted = {f"{self._parent}/{name}/skeleton2d" for name in possible}
+        possible = [name for name in names if _ID.fullmatch(name) and len(self._topic(name)) <= _MAX_TOPIC][:limit]
+        wanted = set(map(self._topic, possible))
         for topic in self._opened.keys() - wanted:
             self._close(self._opened.pop(topic))
         for topic in sorted(wanted - self._opened.keys()):
             self._opened[topic] = self._open(topic)
         return [name for name in names if name not in possible]
+
+    def _topic(self, name: str) -> str:
+        return f"{self._parent}/{name}/skeleton2d"
 
     def clear(self) -> None:
         """Close all topics."""

@@ -207,6 +207,18 @@ _ALL = (
     ),
     # --- notes
     Reason(
+        "unknown_parameter",
+        NOTE,
+        "The node was given a parameter that it does not have",
+        "Correct its name: the log says the nearest one at start.",
+    ),
+    Reason(
+        "callback_failed",
+        NOTE,
+        "A fault of paul_ros or rclpy: a service request, a timer or an event ended in an error, and the node goes on",
+        "Report it with the traceback in the log.",
+    ),
+    Reason(
         "distorted_image",
         NOTE,
         "CameraInfo has distortion but no P, so K is used and positions are slightly wrong",
