@@ -41,6 +41,8 @@ CASES = {
     "recordings": 50,
     "models": 50,
     "layouts": 50,
+    "services": 100,
+    "requests": 100,
 }
 
 
@@ -59,7 +61,9 @@ def quiet():
 
 
 @pytest.mark.parametrize("kind", CASES)
-def test_nothing_crashes_and_no_frame_is_lost_uncounted(kind):
+def test_nothing_crashes_and_no_frame_is_lost_uncounted(kind, request):
+    if kind in ("services", "requests"):
+        request.getfixturevalue("ros")
     report = command.fuzz(CASES[kind], seed=11, kinds=(kind,))
     assert report["cases"] == CASES[kind]
     row = report["kinds"][kind]
@@ -96,6 +100,16 @@ def test_an_adapter_that_fails_would_be_noticed(monkeypatch):
     assert not command.fuzz(50, kinds=("junk",))["crashes"]
     monkeypatch.setattr(msg_adapters, "SUPPORTED", failing(raises(MessageError("no", "advice"))))
     assert not command.fuzz(50, kinds=("fields",))["crashes"]
+
+
+def test_a_service_that_raises_would_be_noticed(ros, monkeypatch):
+    monkeypatch.setattr("paul_ros.ros.node.guard_services", lambda *_: None)
+    assert command.fuzz(100, kinds=("services",))["crashes"]
+
+
+def test_a_node_that_no_longer_lifts_would_be_noticed(ros, monkeypatch):
+    monkeypatch.setattr("paul_ros.ros.pipeline.Pipeline.on_keypoints", lambda *_: None)
+    assert command.fuzz(25, kinds=("services",))["crashes"]
 
 
 def test_a_message_that_vanishes_would_be_noticed(monkeypatch):

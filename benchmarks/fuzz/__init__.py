@@ -17,7 +17,9 @@ and then broken in a few places:
   known.
 - models: the file, or its contents under a correct checksum.
 - layouts: the YAML text, or the values in it.
-- services: requests to a running node over DDS, by id and by label, with odd types and names.  It must lift afterwards.
+- services: requests to the services of a node, in this process.  Each must be answered as the node's state and the
+  values demand, and the node must lift the next frame.
+- requests: the same to a node of its own process over DDS.  Each must be answered, and the node must live and lift.
 
 A crash is an exception that the documentation does not promise, a warning of NumPy, or an output that is not finite.
 A message is lost uncounted if it becomes neither a frame, nor a part of one, nor a drop.  A silent misreading is an

@@ -23,7 +23,7 @@ from paul_ros.stream.messages import MessageBuilder
 from paul_ros.stream.stream import LiftStream
 
 if TYPE_CHECKING:
-    from benchmarks.fuzz.services import Node
+    from benchmarks.fuzz.requests import Node
 
 
 class Bench:
@@ -52,7 +52,7 @@ class Bench:
     def node(self) -> Node:
         """Return the running node that all sessions share; the first call starts it."""
         if self._node is None:
-            from benchmarks.fuzz.services import Node
+            from benchmarks.fuzz.requests import Node
 
             with warnings.catch_warnings():
                 warnings.simplefilter("default")  # the imports of rclpy warn

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from benchmarks.fuzz.bench import Bench
 from benchmarks.fuzz.recordings import recording_session
+from benchmarks.fuzz.requests import request_session
 from benchmarks.fuzz.scenes import scene_session
 from benchmarks.fuzz.services import service_session
 from benchmarks.fuzz.sessions import (
@@ -36,6 +37,7 @@ SESSIONS: dict[str, Session] = {
     "models": model_session,
     "layouts": layout_session,
     "services": service_session,
+    "requests": request_session,
 }
 """Kind -> session."""
 
@@ -48,7 +50,8 @@ SHARES = {
     "recordings": 0.05,
     "models": 0.04,
     "layouts": 0.02,
-    "services": 0.10,
+    "services": 0.06,
+    "requests": 0.04,
 }
 """Kind -> share of the cases."""
 

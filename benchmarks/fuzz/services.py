@@ -1,305 +1,249 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Requests to every service of a running node, over DDS, with odd ids, types, names and lengths, while frames come.
-
-The oracle is the state machine of managed nodes (design.ros2.org, Managed nodes) and the parameters as the node itself
-returned them: every request is answered, a refusal changes nothing, and every frame that was sent is lifted.
-"""
+"""Sessions of requests to the services of a real node, in this process. They need ROS."""
 
 from __future__ import annotations
 
-import contextlib
+import gc
+import math
 import os
 import random
 import string
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from pathlib import Path
+import warnings
 from typing import Any
 
-import numpy as np
+import foreign_messages as foreign
 
 from benchmarks.fuzz.bench import Bench
-from benchmarks.fuzz.messages import COCO, random_pose
+from benchmarks.fuzz.messages import cloud, header, random_pose
 from benchmarks.fuzz.tally import Tally, WrongOutput
-from msg_adapters import outputs
 
-_PATIENCE = 20.0
-"""Seconds until a request counts as unanswered."""
-
-_UNCONFIGURED, _INACTIVE, _ACTIVE, _FINALIZED = 1, 2, 3, 4
-
-_TRANSITIONS = {
-    (_UNCONFIGURED, 1): _INACTIVE,
-    (_INACTIVE, 2): _UNCONFIGURED,
-    (_INACTIVE, 3): _ACTIVE,
-    (_ACTIVE, 4): _INACTIVE,
+#: State -> id of a transition -> the state after it.
+ALLOWED = {
+    "unconfigured": {1: "inactive", 5: "finalized"},
+    "inactive": {2: "unconfigured", 3: "active", 6: "finalized"},
+    "active": {4: "inactive", 7: "finalized"},
+    "finalized": {},
 }
-"""State and transition -> next state. Shutdown, which ends the node for good, is left to the tests."""
+LABELS = {1: "configure", 2: "cleanup", 3: "activate", 4: "deactivate", 5: "shutdown", 6: "shutdown", 7: "shutdown"}
+#: Live parameter -> type, and lowest and highest number or texts that are taken in any order.
+LIVE = {
+    "smoothing": (3, 0.0, 100.0),
+    "min_confidence": (3, 0.0, 1.0),
+    "max_persons": (2, 1, 10000),
+    "layout": (4, "", "coco17"),
+    "output_layout": (4, "", "coco17"),
+    "model": (4, "human", "human"),
+}
+FIXED = ("autostart", "publish_tf", "input_type", "start_type_description_service")
+ODD_NAMES = ("", "smothing", "a/b", ".", "smoothing.x", "/lifter/smoothing", "x" * 5000, "é 猫\n", "%s{}", "a\tb")
+ODD_NUMBERS = (math.nan, math.inf, -math.inf, -1e-9, -0.5, 1e308, 5e-324)
+FIELDS = ("bool", "integer", "double", "string", "byte_array", "bool_array", "integer_array", "double_array")
 
-_LABELS = {"configure": 1, "cleanup": 2, "activate": 3, "deactivate": 4}
-_TYPES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 77, 128, 255)
-_NUMBERS = (0.0, 1.0, -1.0, 0.5, 1e308, float("nan"), float("inf"), -0.0)
-_INTEGERS = (0, 1, -1, 17, 2**31, 2**63 - 1, -(2**63))
-_TEXTS = ("", "x", "coco17", "human", "/", "a/b", "~", "ä" * 40, "\n", "%s", "7" * 2000)
 
+def service_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, where: str) -> None:
+    """Send requests to one node, with frames between them; each must be answered as its state and values demand."""
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    # rclpy's own imports.
+    warnings.simplefilter("ignore", DeprecationWarning)
+    import rclpy
 
-class Node:
-    """A lifter in its own process, and the clients of its services."""
-
-    def __init__(self, folder: Path) -> None:
-        import rclpy
-        from geometry_msgs.msg import PoseArray
-        from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
-        from rcl_interfaces.srv import (
-            DescribeParameters,
-            GetParameters,
-            GetParameterTypes,
-            ListParameters,
-            SetParameters,
-            SetParametersAtomically,
-        )
-        from sensor_msgs.msg import PointCloud2
-
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-        os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-        environment = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
-        self.log = folder / "lifter.log"
-        with open(self.log, "wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "paul_ros.ros.lifter_process"], env=environment, stdout=log, stderr=log
-            )
-        self._rclpy = rclpy
+    if not rclpy.ok():
         rclpy.init()
-        self.node = rclpy.create_node("fuzz")
-        kinds = (
-            ("change_state", ChangeState),
-            ("get_state", GetState),
-            ("get_available_states", GetAvailableStates),
-            ("get_available_transitions", GetAvailableTransitions),
-            ("get_transition_graph", GetAvailableTransitions),
-            ("set_parameters", SetParameters),
-            ("set_parameters_atomically", SetParametersAtomically),
-            ("get_parameters", GetParameters),
-            ("get_parameter_types", GetParameterTypes),
-            ("describe_parameters", DescribeParameters),
-            ("list_parameters", ListParameters),
-        )
-        self.kinds = dict(kinds)
-        self.clients = {name: self.node.create_client(kind, f"/lifter/{name}") for name, kind in kinds}
-        self.lifted: list[int] = []
-        self.keypoints = self.node.create_publisher(PointCloud2, "keypoints", 10)
-        self.node.create_subscription(
-            PoseArray, "lifter/poses", lambda message: self.lifted.append(message.header.stamp.sec), 100
-        )
-        self.sent = 0
-        for client in self.clients.values():
-            self._until(client.service_is_ready, "a service")
-
-    def close(self) -> None:
-        """End the node and the clients."""
-        self.process.terminate()
-        self.process.wait(_PATIENCE)
-        self.node.destroy_node()
-        self._rclpy.shutdown()
-
-    def call(self, name: str, request: Any) -> Any:
-        """Return the response to a request.
-
-        Raises:
-            WrongOutput: there is none, or the node has ended.
-        """
-        future = self.clients[name].call_async(request)
-        self._until(future.done, f"an answer of {name} to {request}")
-        return future.result()
-
-    def request(self, name: str, **fields: Any) -> Any:
-        """Return an empty request of a service with some fields set."""
-        return self.kinds[name].Request(**fields)
-
-    def lift(self, rng: random.Random, frames: int) -> None:
-        """Send frames and wait until each is lifted.
-
-        Raises:
-            WrongOutput: one is not.
-        """
-        self._until(self.keypoints.get_subscription_count, "the subscription")
-        self._until(lambda: self.node.count_publishers("/lifter/poses"), "the publisher")
-        first = self.sent + 1
-        for _ in range(frames):
-            self.sent += 1
-            self.keypoints.publish(_cloud(self.sent, rng))
-            self._until(lambda: self.sent in self.lifted, f"frame {self.sent}")
-        self.lifted = [stamp for stamp in self.lifted if stamp >= first]
-
-    def _until(self, condition: Any, what: str) -> None:
-        end = time.monotonic() + _PATIENCE
-        while not condition():
-            if self.process.poll() is not None:
-                raise WrongOutput(f"the node ended while waiting for {what[:200]}: {self.log.read_text()[-600:]}")
-            if time.monotonic() > end:
-                raise WrongOutput(f"never came: {what[:200]}")
-            self._rclpy.spin_once(self.node, timeout_sec=0.05)
-
-
-def _cloud(seconds: int, rng: random.Random) -> Any:
-    """Return a PointCloud2 of one person."""
-    from paul_ros.ros.messages import RosMake
-
-    make, pose = RosMake(), random_pose(rng)
-    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=0)
-    head = make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
-    xy = np.array([[pose[name] for name in COCO]])
-    return outputs.keypoints_cloud(make, head, xy, np.full(xy.shape[:2], 0.9), ["1"])
-
-
-@contextlib.contextmanager
-def running_node(folder: Path) -> Iterator[Node]:
-    """Run a node during the block."""
-    node = Node(folder)
+    node = _Node(bench, rng)
     try:
-        yield node
+        for _ in range(cases):
+            tally.cases += 1
+            start = time.process_time()
+            try:
+                accepted = node.case()
+                tally.accepted += accepted
+                tally.refused += not accepted
+            except Exception:
+                tally.crash(where)
+            tally.time(time.process_time() - start)
     finally:
         node.close()
 
 
-def service_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, where: str) -> None:
-    """Send odd requests to the node, then bring it back and lift."""
-    node = bench.node()
-    for number in range(cases):
-        name = rng.choice(sorted({*node.clients, "change_state", "set_parameters"}))
-        tally.cases += 1
-        start = time.process_time()
-        try:
-            accepted = _REQUESTS.get(name, _ask)(node, name, rng)
-            tally.accepted += accepted
-            tally.refused += not accepted
-        except WrongOutput as error:
-            tally.misread(f"{where} case {number} {name}", str(error))
-            if node.process.poll() is not None:
-                raise
-        except Exception:
-            tally.crash(f"{where} case {number} {name}")
-        tally.time(time.process_time() - start)
-    _activate(node)
-    _restore(node)
-    node.lift(rng, 3)
+class _Node:
+    """A node, the state that it must be in, and the faults that it reports."""
 
+    def __init__(self, bench: Bench, rng: random.Random) -> None:
+        self._bench, self._rng = bench, rng
+        self._open()
 
-def _state(node: Node) -> int:
-    return int(node.call("get_state", node.request("get_state")).current_state.id)
+    def _open(self) -> None:
+        from rclpy.logging import LoggingSeverity, set_logger_level
 
+        from paul_ros.ros.node import LifterNode
 
-def _activate(node: Node) -> None:
-    """Bring the node to the active state by its own services."""
-    for transition in {_UNCONFIGURED: (1, 3), _INACTIVE: (3,)}.get(_state(node), ()):
-        request = node.request("change_state")
-        request.transition.id = transition
-        if not node.call("change_state", request).success:
-            raise WrongOutput(f"transition {transition} is refused: {node.log.read_text()[-300:]}")
+        faults: list[str] = []
 
+        class Watched(LifterNode):
+            def report_fault(self, where: str, error: Exception) -> None:
+                faults.append(f"{where}: {error!r}")
 
-def _restore(node: Node) -> None:
-    """Set the parameters that may change to their defaults."""
-    from rclpy.parameter import Parameter
+        for logger in ("lifter", "rcl"):
+            set_logger_level(logger, LoggingSeverity.FATAL)
+        self._node, self._faults, self._state, self._frames = Watched(), faults, "unconfigured", 0
+        for number in (1, 3):
+            self._change(number, "")
 
-    from paul_ros.stream.parameters import DEFAULTS, LIVE
+    def close(self) -> None:
+        """Finalize and destroy the node."""
+        self._node.end()
+        self._node.destroy_node()
+        del self._node
+        gc.collect()  # callbacks of a node refer to it
 
-    values = [Parameter(name, value=DEFAULTS[name]).to_parameter_msg() for name in LIVE]
-    for result in node.call("set_parameters", node.request("set_parameters", parameters=values)).results:
-        if not result.successful:
-            raise WrongOutput(f"a default is refused: {result.reason}")
+    def case(self) -> bool:
+        """Send one request, then a frame; return whether the request was accepted.
 
+        Raises:
+            WrongOutput: the answer is wrong, or the node reported a fault or does not lift.
+        """
+        rng = self._rng
+        if self._state == "finalized" and rng.random() < 0.5:
+            self.close()
+            self._open()
+        accepted = rng.choice(
+            (self._transition, self._parameters, self._parameters, self._atomically, self._question)
+        )()
+        if self._faults:
+            raise WrongOutput(f"faults: {self._faults}")
+        if self._node.active != (self._state == "active"):
+            raise WrongOutput(f"the node should be {self._state}")
+        if self._node.active:
+            self._lift()
+        return accepted
 
-def _change_state(node: Node, name: str, rng: random.Random) -> bool:
-    """Request a transition by id, by label, by both or by none."""
-    before = _state(node)
-    request = node.request(name)
-    request.transition.id = rng.choice((0, 1, 1, 2, 2, 3, 3, 4, 4, 8, 10, 50, 60, 61, 77, 97, 255))
-    request.transition.label = rng.choice(("", "", "", *_LABELS, "x", "ä" * 300))
-    success = node.call(name, request).success
-    # As in rclcpp, a label decides if there is one.
-    wanted = _LABELS.get(request.transition.label) if request.transition.label else request.transition.id
-    after = _TRANSITIONS.get((before, wanted or 0))
-    if success != (after is not None):
-        raise WrongOutput(f"{request.transition} in state {before} is answered by {success}")
-    if _state(node) != (after or before):
-        raise WrongOutput(f"{request.transition} in state {before} leads to state {_state(node)}")
-    return bool(success)
+    def _ask(self, name: str, **fields: Any) -> Any:
+        """Send a request as its bytes, and return the answer that its bytes make."""
+        from rclpy.serialization import deserialize_message, serialize_message
 
+        (service,) = (item for item in self._node.services if item.service_name == f"/lifter/{name}")
+        kind = service.srv_type
+        request = deserialize_message(serialize_message(kind.Request(**fields)), kind.Request)
+        return deserialize_message(serialize_message(service.callback(request, kind.Response())), kind.Response)
 
-def _set_parameters(node: Node, name: str, rng: random.Random) -> bool:
-    """Set odd parameters; each that is refused must keep its value."""
-    from rcl_interfaces.msg import Parameter
+    def _lift(self) -> None:
+        make = self._bench.bag
+        self._frames += 1
+        message = cloud(make, header(make, self._rng, self._frames), [random_pose(self._rng)], self._rng)
+        before = self._node.stream.counts["frames"]
+        self._node.pipeline.on_keypoints(foreign.CLOUD, make.serialise(message), "/keypoints", 0)
+        if self._node.stream.counts["frames"] != before + 1:
+            raise WrongOutput(f"the node does not lift: {dict(self._node.stream.ledger.drops)}")
 
-    from paul_ros.stream.parameters import DEFAULTS
+    # --- transitions
 
-    names = [*DEFAULTS, "use_sim_time", "smothing", "", "a.b", "/", "x" * 300]
-    count = rng.choice((0, 1, 1, 1, 2, 3, 200 if rng.random() < 0.05 else 4))
-    # The clock of the node is left alone, or nothing would be lifted.
-    parameters = [Parameter(name=rng.choice(names), value=_value(rng)) for _ in range(count)]
-    parameters = [each for each in parameters if each.name != "use_sim_time" or each.value.type != 1]
-    known = sorted({each.name for each in parameters} & set(DEFAULTS))
-    before = _values(node, known)
-    answer = node.call(name, node.request(name, parameters=parameters))
-    results = answer.results if name == "set_parameters" else [answer.result] * len(parameters)
-    if len(results) != len(parameters):
-        raise WrongOutput(f"{len(parameters)} parameters, {len(results)} results")
-    if any(not each.successful and not each.reason for each in results):
-        raise WrongOutput("a refusal without a reason")
-    after = _values(node, known)
-    changed = {each.name for each, result in zip(parameters, results) if result.successful}
-    for parameter in known:
-        if parameter not in changed and before[parameter] != after[parameter]:
-            raise WrongOutput(f"{parameter} was refused and changed from {before[parameter]} to {after[parameter]}")
-    return bool(results) and all(each.successful for each in results)
+    def _transition(self) -> bool:
+        rng = self._rng
+        number = rng.choice((*LABELS, *LABELS, *LABELS, rng.randrange(256)))
+        label = rng.choice(("", "", "", *LABELS.values(), *ODD_NAMES))
+        # An end takes a new node, so it is rare.
+        if ALLOWED[self._state].get(number) == "finalized" and rng.random() < 0.9:
+            number, label = 77, ""
+        if label == "shutdown":
+            label = "Shutdown"
+        return self._change(number, label)
 
+    def _change(self, number: int, label: str) -> bool:
+        from lifecycle_msgs.msg import Transition
 
-def _values(node: Node, names: list[str]) -> dict[str, str]:
-    found = node.call("get_parameters", node.request("get_parameters", names=names)).values
-    return dict(zip(names, map(str, found)))
+        allowed = ALLOWED[self._state]
+        if label:
+            number = next((key for key in allowed if LABELS[key] == label), 0)
+        done = self._ask("change_state", transition=Transition(id=number, label=label)).success
+        if done != (number in allowed):
+            raise WrongOutput(f"transition {number} {label!r} in state {self._state}: {done}")
+        self._state = allowed.get(number, self._state)
+        if (state := self._ask("get_state").current_state.label) != self._state:
+            raise WrongOutput(f"the state is {state}, not {self._state}")
+        return done
 
+    # --- parameters
 
-def _value(rng: random.Random) -> Any:
-    """Return a value of any type, whose type may not be that of its content."""
-    from rcl_interfaces.msg import ParameterValue
+    def _parameters(self) -> bool:
+        given = [self._parameter() for _ in range(self._rng.choice((1, 1, 2, 5)))]
+        answer = self._ask("set_parameters", parameters=[parameter for parameter, _ in given])
+        self._check([result for result in answer.results], [good for _, good in given])
+        for parameter, good in given[-1:]:
+            if good:
+                self._check_value(parameter)
+        return any(good for _, good in given)
 
-    return ParameterValue(
-        type=rng.choice(_TYPES),
-        bool_value=rng.random() < 0.5,
-        integer_value=rng.choice(_INTEGERS),
-        double_value=rng.choice(_NUMBERS),
-        string_value=rng.choice(_TEXTS),
-        byte_array_value=[b"\0"] * rng.choice((0, 3)),
-        bool_array_value=[True] * rng.choice((0, 2)),
-        integer_array_value=[rng.choice(_INTEGERS)] * rng.choice((0, 1)),
-        double_array_value=[rng.choice(_NUMBERS)] * rng.choice((0, 1)),
-        string_array_value=[rng.choice(_TEXTS)] * rng.choice((0, 1)),
-    )
+    def _atomically(self) -> bool:
+        given = [self._parameter() for _ in range(self._rng.choice((1, 1, 2, 5)))]
+        answer = self._ask("set_parameters_atomically", parameters=[parameter for parameter, _ in given])
+        good = all(good for _, good in given)
+        self._check([answer.result], [good])
+        if good:
+            self._check_value(given[-1][0])
+        return good
 
+    def _check(self, results: list[Any], expected: list[bool]) -> None:
+        if [result.successful for result in results] != expected:
+            raise WrongOutput(f"{results} is not {expected}")
+        for result in results:
+            if not result.successful and not 5 < len(result.reason) < 2500:
+                raise WrongOutput(f"a refusal without a reason: {result.reason!r}")
 
-def _ask(node: Node, name: str, rng: random.Random) -> bool:
-    """Send a request that changes nothing, with odd names."""
-    from paul_ros.stream.parameters import DEFAULTS
+    def _check_value(self, parameter: Any) -> None:
+        (value,) = self._ask("get_parameters", names=[parameter.name]).values
+        given = parameter.value
+        wanted = (
+            given.integer_value if given.type == 2 else given.double_value if given.type == 3 else given.string_value
+        )
+        if wanted != (value.integer_value, value.double_value, value.string_value)[value.type - 2]:
+            raise WrongOutput(f"{parameter.name} is {value}, not {wanted}")
 
-    request = node.request(name)
-    if hasattr(request, "names"):
-        odd = (*DEFAULTS, *_TEXTS, "".join(rng.choices(string.printable, k=20)))
-        request.names = [rng.choice(odd) for _ in range(rng.choice((0, 1, 3, 10_000 if rng.random() < 0.01 else 10)))]
-    if hasattr(request, "prefixes"):
-        request.prefixes = [rng.choice((*_TEXTS, "qos_overrides")) for _ in range(rng.choice((0, 1, 3)))]
-        request.depth = rng.choice((0, 1, 2**63, 2**64 - 1))
-    before = _state(node)
-    node.call(name, request)
-    if _state(node) != before:
-        raise WrongOutput(f"{name} changed the state")
-    return True
+    def _parameter(self) -> tuple[Any, bool]:
+        """Return a parameter of a request, and whether it must be accepted."""
+        from rcl_interfaces.msg import Parameter, ParameterValue
 
+        rng = self._rng
+        name = rng.choice((*LIVE, *LIVE, *FIXED, *ODD_NAMES, "".join(rng.choices(string.printable, k=8))))
+        kind, low, high = LIVE.get(name, (0, 0, 0))
+        if kind and rng.random() < 0.5:
+            value: Any = rng.choice((low, high))
+            if kind == 3:
+                value = rng.choice((low, high, rng.uniform(low, high), *ODD_NUMBERS))
+            elif kind == 2:
+                value = rng.choice((low, high, 0, -1, high + 1, 2**63 - 1, -(2**63)))
+            good = kind == 4 or low <= value <= high or value == 5e-324
+            return Parameter(name=name, value=ParameterValue(type=kind, **{f"{FIELDS[kind - 1]}_value": value})), good
+        other = rng.choice((*range(10), 10, 77, 255))
+        value = ParameterValue(type=other, integer_value=1, double_value=1.0, string_value="coco17", bool_value=True)
+        number = other == 2 and kind in (2, 3) or other == 3 and kind == 3
+        good = number or (kind == other == 4 and name != "model")
+        if kind == other == 4 and name == "model" and self._state in ("unconfigured", "finalized"):
+            return self._parameter()  # only configuring can tell whether it is a model
+        return Parameter(name=name, value=value), good
 
-_REQUESTS = {
-    "change_state": _change_state,
-    "set_parameters": _set_parameters,
-    "set_parameters_atomically": _set_parameters,
-}
+    # --- questions
+
+    def _question(self) -> bool:
+        rng = self._rng
+        names = rng.choices((*LIVE, *FIXED, *ODD_NAMES), k=rng.choice((0, 1, 2, 300)))
+        name, fields = rng.choice(
+            (
+                ("get_parameters", {"names": names}),
+                ("get_parameter_types", {"names": names}),
+                ("describe_parameters", {"names": names}),
+                ("list_parameters", {"prefixes": names, "depth": rng.choice((0, 1, 2**64 - 1))}),
+                ("get_type_description", {"type_name": rng.choice(("std_msgs/msg/String", *ODD_NAMES))}),
+                ("get_available_states", {}),
+                ("get_available_transitions", {}),
+                ("get_transition_graph", {}),
+            )
+        )
+        answer = self._ask(name, **fields)
+        if name in ("get_parameters", "get_parameter_types", "describe_parameters"):
+            known = all(item in LIVE or item in FIXED for item in names)
+            (values,) = (getattr(answer, field) for field in answer.get_fields_and_field_types())
+            if len(values) != (len(names) if known else 0):
+                raise WrongOutput(f"{len(values)} answers of {name} for {names}")
+            return known
+        return True
