@@ -8,30 +8,36 @@ from dataclasses import replace
 from typing import Any
 
 import msg_adapters
-from msg_adapters import Keypoints2D, Source, WrongPointCount
+from msg_adapters import Keypoints2D, Source, UnknownLayout, WrongPointCount
 from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout, layout_names, load_layout
 
-PREFERRED = ("coco17", "h36m17", "openpose18", "body25", "mediapipe33")
+PREFERRED = ("coco17", "h36m17", "openpose18", "body25", "mediapipe33", "cmu31", "hri18", "human")
 """Shipped layouts in the order in which a message's number of points is tried; the others follow."""
 
 
 def read_in_fitting_layout(model: Layout, type_name: str, msg: Any, source: Source) -> tuple[Keypoints2D, Layout]:
     """Read a message in the layout that fits it best.
 
-    The first of `candidates` with the right number of points is taken.
+    The first of `candidates` with the right number of points is taken. A plain list of keypoints must be one person:
+    its number of persons is not guessed.
 
     Returns:
         The keypoints and the layout in which they were read.
 
     Raises:
+        UnknownLayout: a plain list may be one person or several.
         WrongPointCount: no candidate has as many points.
         MessageError: as `msg_adapters.read`.
     """
     refusal: WrongPointCount | None = None
-    for layout in candidates(model, msg_adapters.named_layout(type_name, msg)):
+    layouts = candidates(model, msg_adapters.named_layout(type_name, msg))
+    source = replace(source, candidates=tuple({len(layout.names) for layout in layouts}))
+    for layout in layouts:
         try:
             return msg_adapters.read(type_name, msg, len(layout.names), replace(source, names=layout.names)), layout
+        except UnknownLayout:
+            raise
         except WrongPointCount as error:
             refusal = refusal or error
     assert refusal is not None  # the model's own layout is always a candidate

@@ -275,6 +275,8 @@ class LiftStream:
             route = Route.between(found, self.lifter.model.layout, self._output_layout)
             if keypoints.visible.any():
                 self._known = route
+        for note in keypoints.notes:
+            self.ledger.note(note.reason, advice.sentence(note.text))
         return route.keypoints_in(keypoints, self.min_confidence)
 
     def _check_persons(self, persons: int) -> None:
