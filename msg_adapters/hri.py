@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, MessageError, Source, by_name, is_placeholder, record
+from msg_adapters.keypoints import Keypoints2D, MessageError, Source, by_name, record
 
 # fmt: off
 #: The order of the message (constants of hri_msgs/Skeleton2D).
@@ -32,8 +32,8 @@ _MIN_COORDINATE, _MAX_COORDINATE = -1.0, 2.0
 def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     """Read one body.
 
-    Field: skeleton[18] with x, y (0 to 1 from the image's top left corner) and c (0 to 1). A point with c = 0, or at
-    (0, 0) or (-1, -1), is missing.
+    Field: skeleton[18] with x, y (0 to 1 from the image's top left corner) and c (0 to 1). A point with c = 0 is
+    missing, also one that was never filled.
 
     Raises:
         MessageError: no_image_size, not_normalised, wrong_skeleton_size, no_common_names.
@@ -45,12 +45,13 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
             f"the skeleton has {len(values)} keypoints; hri_msgs/Skeleton2D needs {len(NAMES)}, with c = 0 for missing "
             "ones",
         )
-    seen = (values[:, 2] > 0) & ~is_placeholder(values[:, 0], values[:, 1])
+    seen = values[:, 2] > 0
     far = np.any((values[:, :2] < _MIN_COORDINATE) | (values[:, :2] > _MAX_COORDINATE), axis=1)
     _check_normalised(seen, far)
     values[far | ~seen] = np.nan
     placed = by_name(values, NAMES, source.names)[None]
-    return record(placed[..., :2] * _size(source), placed[..., 2], (_body_id(source.topic),), msg.header)
+    ids = (_body_id(source.topic),)
+    return record(placed[..., :2] * _size(source), placed[..., 2], ids, msg.header, placeholders=False)
 
 
 def _check_normalised(seen: np.ndarray, far: np.ndarray) -> None:

@@ -42,16 +42,21 @@ class WrongPointCount(MessageError):
         fits: tells if a layout with the given number of keypoints would fit.
     """
 
-    def __init__(self, advice: str, fits: Callable[[int], bool], reason: str = "wrong_point_count") -> None:
-        super().__init__(reason, advice)
+    def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
+        super().__init__("wrong_point_count", advice)
         self.fits = fits
 
 
-class UnknownLayout(WrongPointCount):
-    """A list of keypoints that may be one person or several, while the layout is unknown."""
+class UnknownLayout(MessageError):
+    """A list of keypoints that may be one person or several, while the layout is unknown.
+
+    Attributes:
+        fits: tells if a layout with the given number of keypoints would fit.
+    """
 
     def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
-        super().__init__(advice, fits, "layout_unknown")
+        super().__init__("layout_unknown", advice)
+        self.fits = fits
 
 
 class Note(NamedTuple):
@@ -229,7 +234,11 @@ def refuse_normalised(keypoints: Keypoints2D) -> None:
     Raises:
         MessageError: normalised.
     """
-    if keypoints.visible.sum() >= _LEAST_POINTS and not (np.abs(keypoints.xy) > _NORMALISED).any():
+    if (np.abs(keypoints.xy) > _NORMALISED).any() or keypoints.visible.sum() < _LEAST_POINTS:
+        return
+    xy = keypoints.xy[keypoints.visible]
+    # Points all in one place are no person in either unit.
+    if (np.ptp(xy, axis=0) > 0).all():
         raise MessageError(
             "normalised",
             f"all {keypoints.visible.sum()} keypoints lie within {_NORMALISED} pixels of the image's corner, so they "
@@ -238,7 +247,12 @@ def refuse_normalised(keypoints: Keypoints2D) -> None:
 
 
 def record(
-    xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header: Any, present: np.ndarray | None = None
+    xy: np.ndarray,
+    confidence: np.ndarray | None,
+    ids: tuple[str, ...],
+    header: Any,
+    present: np.ndarray | None = None,
+    placeholders: bool = True,
 ) -> Keypoints2D:
     """Make the record from raw arrays and mark implausible points as missing.
 
@@ -252,10 +266,13 @@ def record(
         ids: N person ids as text, '' if unknown.
         header: std_msgs/Header.
         present: (N, P) bool, or None if the family marks missing points by their values only.
+        placeholders: whether (0, 0), (-1, -1) and the like are missing; False if the family has a mark of its own.
     """
     xy = as_float64(xy)
     with np.errstate(invalid="ignore"):
-        visible = (np.abs(xy) <= MAX_PIXELS).all(axis=-1) & ~is_placeholder(xy[..., 0], xy[..., 1])
+        visible = (np.abs(xy) <= MAX_PIXELS).all(axis=-1)
+    if placeholders:
+        visible &= ~is_placeholder(xy[..., 0], xy[..., 1])
     if present is not None:
         visible &= present
     notes: tuple[Note, ...] = ()

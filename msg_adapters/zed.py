@@ -42,7 +42,7 @@ BODY38 = (
 )
 # fmt: on
 #: Object.body_format -> the layout with its points, and their order.
-_FORMATS = {0: ("zed18", OPENPOSE18), 1: ("zed34", BODY34), 2: ("zed38", BODY38)}
+_FORMATS = {0: ("openpose18", OPENPOSE18), 1: ("zed34", BODY34), 2: ("zed38", BODY38)}
 
 
 def read(msg: Any, points: int, source: Source) -> Keypoints2D:
@@ -67,7 +67,7 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
 
 
 def layout(msg: Any) -> str | None:
-    """Return zed18, zed34 or zed38 if all bodies have its format, else None."""
+    """Return openpose18, zed34 or zed38 if all bodies have its format, else None."""
     names = {_format(body)[0] for body in msg.objects if body.skeleton_available}
     return names.pop() if len(names) == 1 else None
 

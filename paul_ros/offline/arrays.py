@@ -15,6 +15,7 @@ from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout
 from paul_ros.lifted import Lifted
 from paul_ros.lifter import Lifter
+from paul_ros.placeholders import placeholders
 from paul_ros.route import Route
 from paul_ros.stream.layout_search import candidates
 
@@ -48,7 +49,7 @@ class Persons:
         confidence: np.ndarray | None = None,
         visible: np.ndarray | None = None,
     ) -> Persons:
-        """Hide what no camera can have seen, by the rules for messages.
+        """Hide what no camera can have seen, by the rules for messages, and placeholders.
 
         Args:
             frame: (N,) int.
@@ -57,7 +58,9 @@ class Persons:
             confidence: (N,P), or None if the source has none.
             visible: (N,P) bool, or None if hidden points are NaN.
         """
-        read = record(xy, confidence, person, _NO_HEADER, visible)
+        shown = np.isfinite(xy).all(axis=2) if visible is None else visible
+        shown = shown & ~placeholders(xy[..., 0], xy[..., 1], shown)
+        read = record(xy, confidence, person, _NO_HEADER, shown, placeholders=False)
         return cls(frame, person, read.xy, read.confidence, read.visible)
 
     @classmethod

@@ -8,8 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import msg_adapters
-from msg_adapters import Keypoints2D, Source, UnknownLayout, WrongPointCount
-from paul_ros.errors import LayoutError
+from msg_adapters import Keypoints2D, Source, WrongPointCount
 from paul_ros.layout import Layout, layout_names, load_layout
 
 PREFERRED = ("coco17", "h36m17", "openpose18", "body25", "mediapipe33", "cmu31", "hri18", "human")
@@ -36,8 +35,6 @@ def read_in_fitting_layout(model: Layout, type_name: str, msg: Any, source: Sour
     for layout in layouts:
         try:
             return msg_adapters.read(type_name, msg, len(layout.names), replace(source, names=layout.names)), layout
-        except UnknownLayout:
-            raise
         except WrongPointCount as error:
             refusal = refusal or error
     assert refusal is not None  # the model's own layout is always a candidate
@@ -54,7 +51,7 @@ def candidates(model: Layout, named: str | None = None) -> list[Layout]:
         model: layout of the model.
         named: name of the layout whose points a message names; None if it names none.
     """
-    fitting = {layout.name: layout for layout in _shipped() if _maps(layout, model)}
+    fitting = {layout.name: layout for layout in _shipped() if layout.fits(model)}
     first = [fitting[named]] if named in fitting else []
     return [*first, model, *fitting.values()]
 
@@ -63,10 +60,3 @@ def candidates(model: Layout, named: str | None = None) -> list[Layout]:
 def _shipped() -> tuple[Layout, ...]:
     """Return the shipped layouts in the order of PREFERRED; reading them takes a tenth of a second."""
     return tuple(load_layout(name) for name in dict.fromkeys([*PREFERRED, *layout_names()]))
-
-
-def _maps(layout: Layout, model: Layout) -> bool:
-    try:
-        return bool(layout.map_to(model))
-    except LayoutError:
-        return False
