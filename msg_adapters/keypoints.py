@@ -15,8 +15,8 @@ import numpy as np
 
 #: Largest plausible coordinate in pixels; points beyond it are missing.
 MAX_PIXELS = 1e6
-#: Keypoints are normalised, and no pixels, if all lie within this of the origin: detectors guess beyond 0..1 too.
-_NORMALISED = 1.5
+#: Keypoints all within this of the origin are normalised, and no pixels: detectors guess far outside 0..1 too.
+_NORMALISED = 3.0
 #: Fewest visible points that show it.
 _LEAST_POINTS = 3
 #: Detectors' peaks exceed 1 slightly; a confidence farther outside 0..1 is noted.
@@ -241,7 +241,7 @@ def refuse_normalised(keypoints: Keypoints2D) -> None:
     if (np.ptp(xy, axis=0) > 0).all():
         raise MessageError(
             "normalised",
-            f"all {keypoints.visible.sum()} keypoints lie within {_NORMALISED} pixels of the image's corner, so they "
+            f"all {keypoints.visible.sum()} keypoints lie within {_NORMALISED:g} pixels of the image's corner, so they "
             "look normalised to 0..1; multiply x by the image's width and y by its height",
         )
 

@@ -18,8 +18,8 @@ more."""
 _LEAST_AT_ORIGIN = 0.5
 """A point at a placeholder in a larger share of its frames is the origin of coordinates that have one."""
 
-_NORMALISED = 1.5
-"""Coordinates in 0..1 reach as far at most: detectors guess points outside the image too."""
+_NORMALISED = 3.0
+"""Coordinates normalised to 0..1 reach as far at most: detectors guess points outside the image too."""
 
 
 def placeholders(x: np.ndarray, y: np.ndarray, visible: np.ndarray) -> np.ndarray:

@@ -192,6 +192,12 @@ _ALL = (
         "The number of ground-truth points is not a multiple of the input layout's points",
         "Record the ground truth in the layout of the keypoints, person by person.",
     ),
+    Reason(
+        "truth_not_metres",
+        DROP,
+        "The ground truth is many times as large or as small as the persons that were lifted, so it is not in metres",
+        "Record the ground truth in metres, in the frame of the camera.",
+    ),
     # --- persons
     Reason(
         "person_too_few_points",

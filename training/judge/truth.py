@@ -104,9 +104,9 @@ def random_rotations(count: int, seed: int) -> np.ndarray:
 def load_sequence(path: str | Path) -> Sequence:
     """Read an npz with W (F,2,P) and the truth S (F,3,P).
 
-    Optional arrays: visible (F,P), edges (E,2), metres (one bool), K (3,3), the camera matrix of pixels W, and calibrated
-    (one bool): W are rays. With either of the last two, W becomes the view of a weak-perspective camera at the mean depth
-    of S, in the units of S.
+    Optional arrays: visible (F,P), edges (E,2), metres (one bool), K (3,3), the camera matrix of pixels W, and
+    calibrated (one bool): W are rays. With either of the last two, W becomes the view of a weak-perspective camera at
+    the mean depth of S, in the units of S.
 
     Raises:
         DataError: the file is missing or damaged, an array is missing or does not fit the others, or W and S have
