@@ -422,7 +422,7 @@ BAD = [
     ("npz", {"keypoints": np.ones((1, 17, 4))}, "keypoints is (1, 17, 4)"),
     ("npz", {"W": np.ones((1, 17, 2))}, "W is (1, 17, 2); it must be (F,2,P)"),
     ("npz", {"keypoints": np.ones((0, 17, 2))}, "holds no persons"),
-    ("npz", {"keypoints": np.ones((1, 19, 2))}, "no shipped layout of 19 keypoints fits"),
+    ("npz", {"keypoints": np.ones((1, 29, 2))}, "no shipped layout of 29 keypoints fits"),
     ("npz", {"keypoints": np.ones((1, 17, 2), complex)}, "keypoints has type complex128; it must be number"),
     ("npz", {"keypoints": np.full((1, 17, 2), "a")}, "keypoints has type <U1; it must be number"),
     ("npz", {"keypoints": np.full((1, 17, 2), None)}, "pickled objects"),

@@ -15,13 +15,16 @@ if TYPE_CHECKING:
 _FACTOR = 8.0
 """Ratio of the sizes of truth and lifted persons beyond which their units differ. Children are not that small."""
 
+_LEAST_POINTS = 4
+"""Fewest points with a ground truth by which a person's size is judged."""
+
 _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres or pixels"))
 
 
 def problem(done: Replay) -> str:
     """Return why the ground truth of a replay is not in metres; '' if it may be."""
     ratio = _ratio(done)
-    if 1 / _FACTOR <= ratio <= _FACTOR:
+    if not 0 < ratio or 1 / _FACTOR <= ratio <= _FACTOR:
         return ""
     guess = next((f" It looks like {name}." for size, name in _UNITS if size / 3 < ratio < 3 * size), "")
     return (
@@ -41,11 +44,18 @@ def _ratio(done: Replay) -> float:
         unit = 1.0 if lifted.units == "m" else metres
         for points, true in zip(lifted.points[lifted.ok], truth[lifted.ok]):
             known = np.isfinite(true).all(1)
-            # Without metres only an absurd size shows another unit.
-            size = unit * _extent(points[known]) if unit else MAX_DISTANCE / _FACTOR
-            if known.sum() >= 2 and size > 0 and (true_size := _extent(true[known])) > 0:
-                ratios.append(true_size / size if unit else max(1.0, true_size / size))
+            if known.sum() >= _LEAST_POINTS:
+                ratios.append(_size_ratio(true[known], points[known], unit))
     return float(np.median(ratios)) if ratios else 1.0
+
+
+def _size_ratio(true: np.ndarray, points: np.ndarray, unit: float | None) -> float:
+    """Return the size of true points over that of lifted points (P,3), `unit` metres each."""
+    size = unit * _extent(points) if unit else 0.0
+    if size > 0:
+        return _extent(true) / size
+    # Without metres only an absurd size shows another unit.
+    return max(1.0, _FACTOR * _extent(true) / MAX_DISTANCE)
 
 
 def _extent(points: np.ndarray) -> float:
