@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout
 from paul_ros.placeholders import placeholders
+from paul_ros.placement import centred_view
 from training.errors import DataError
 
 _SCALES = (0.8, 1.25)
@@ -101,12 +103,16 @@ def random_rotations(count: int, seed: int) -> np.ndarray:
     return Q
 
 
-def load_sequence(path: str | Path) -> Sequence:
+def load_sequence(path: str | Path, turned: bool = False) -> Sequence:
     """Read an npz with W (F,2,P) and the truth S (F,3,P).
 
     Optional arrays: visible (F,P), edges (E,2), metres (one bool), K (3,3), the camera matrix of pixels W, and
     calibrated (one bool): W are rays. With either of the last two, W becomes the view of a weak-perspective camera at
     the mean depth of S, in the units of S.
+
+    Args:
+        path: of the npz.
+        turned: with K, W and S become those of cameras that are turned to the object, as the Lifter's are.
 
     Raises:
         DataError: the file is missing or damaged, an array is missing or does not fit the others, or W and S have
@@ -124,11 +130,12 @@ def load_sequence(path: str | Path) -> Sequence:
             raise DataError(
                 f"{name} in '{path}' must be numbers (F,{rows},P), it is {arrays[name].dtype} {arrays[name].shape}"
             )
-    return _sequence(path, **arrays)
+    return _sequence(path, turned, **arrays)
 
 
 def _sequence(
     path: Path,
+    turned: bool,
     W: np.ndarray,
     S: np.ndarray,
     visible: np.ndarray | None = None,
@@ -147,10 +154,10 @@ def _sequence(
     visible &= ~placeholders(W[:, 0], W[:, 1], visible)
     if not np.isfinite(S).any():
         raise DataError(f"the truth S in '{path}' holds no number")
-    if K is None and _is_true(calibrated):
-        K = np.eye(3)
     if K is not None:
-        W = _at_mean_depth(W, S, K, path)
+        W, S = _rays(W, S, visible, _camera(K, path), turned)
+    if K is not None or _is_true(calibrated):
+        W = W * _mean_depth(S, path)[:, None, None]
     _check_units(W, S, visible & np.isfinite(S).all(1), path)
     edges = np.zeros((0, 2), int) if edges is None else edges
     if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu" or not _within(edges, points):
@@ -165,17 +172,34 @@ def _sequence(
     )
 
 
-def _at_mean_depth(W: np.ndarray, S: np.ndarray, K: np.ndarray, path: Path) -> np.ndarray:
-    """Return pixels (F,2,P) of a camera K as image points of weak-perspective cameras, in the units of S (F,3,P)."""
+def _camera(K: np.ndarray, path: Path) -> Intrinsics:
     if K.shape != (3, 3) or K.dtype.kind not in "fiu" or not (K[[0, 1], [0, 1]] > 0).all():
         raise DataError(f"K in '{path}' must be a camera matrix (3,3) in pixels with positive focal lengths")
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    return Intrinsics(fx, fy, cx, cy, 0, 0)
+
+
+def _rays(
+    W: np.ndarray, S: np.ndarray, visible: np.ndarray, camera: Intrinsics, turned: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rays (F,2,P) of pixels W and the truth S (F,3,P), in the frames of cameras turned to the object or not."""
+    if not turned:
+        offset, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+        return (W - offset[:, None]) / focal[:, None], S
+    rays, truth = np.zeros(W.shape), S.astype(float)
+    some = visible.any(1)
+    view = centred_view(W[some].transpose(0, 2, 1), visible[some], camera)
+    rays[some], truth[some] = np.nan_to_num(view.W), view.turn.transpose(0, 2, 1) @ truth[some]
+    return rays, truth
+
+
+def _mean_depth(S: np.ndarray, path: Path) -> np.ndarray:
+    """Return the mean depth (F,) of the true points; 1 in frames without any, which are not judged."""
     known = np.isfinite(S[:, 2])
     depth = np.where(known, S[:, 2], 0.0).sum(1) / np.maximum(known.sum(1), 1)
     if not (depth[known.any(1)] > 0).all():
         raise DataError(f"'{path}' has a camera, but S is not in front of it: save S in the frame of the camera")
-    # Frames without a truth are not judged.
-    depth = np.where(known.any(1), depth, 1.0)
-    return (W - K[:2, 2, None]) / K[[0, 1], [0, 1]][:, None] * depth[:, None, None]
+    return np.where(known.any(1), depth, 1.0)
 
 
 def _check_units(W: np.ndarray, S: np.ndarray, known: np.ndarray, path: Path) -> None:
