@@ -256,8 +256,8 @@ def record(
 ) -> Keypoints2D:
     """Make the record from raw arrays and mark implausible points as missing.
 
-    A point is missing if `present` is False, if it is a placeholder such as (0, 0) or (-1, -1), if x or y is not finite
-    or beyond MAX_PIXELS, or if its confidence is not finite. Confidences are clipped to 0..1: peaks of some detectors
+    A point is missing if `present` is False, or if it is a placeholder such as (0, 0) or (-1, -1). It is missing too if
+    x, y or its confidence is not finite, or if x or y is beyond MAX_PIXELS. Confidences are clipped to 0..1: peaks of some detectors
     exceed one slightly. Confidences far outside are noted.
 
     Args:

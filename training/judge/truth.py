@@ -222,8 +222,8 @@ def _check_units(W: np.ndarray, S: np.ndarray, known: np.ndarray, path: Path) ->
     low, high = _SCALES
     if not low <= scale <= high:
         raise DataError(
-            f"W in '{path}' is {scale:.3g} times as large as x and y of S, so they have different units, such as "
-            "pixels and metres: save the camera matrix as K (3,3), or bring W and S to one unit"
+            f"W in '{path}' is {scale:.3g} times as large as x and y of S: they have different units, such as "
+            "pixels and metres. Save the camera matrix as K (3,3), or bring W and S to one unit"
         )
 
 
