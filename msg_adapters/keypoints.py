@@ -234,7 +234,10 @@ def refuse_normalised(keypoints: Keypoints2D) -> None:
     Raises:
         MessageError: normalised.
     """
-    if (np.abs(keypoints.xy) > _NORMALISED).any() or keypoints.visible.sum() < _LEAST_POINTS:
+    # The first coordinate alone answers nearly always.
+    if keypoints.xy.size and keypoints.xy.item(0) > _NORMALISED:
+        return
+    if keypoints.visible.sum() < _LEAST_POINTS or (np.abs(keypoints.xy) > _NORMALISED).any():
         return
     xy = keypoints.xy[keypoints.visible]
     # Points all in one place are no person in either unit.
@@ -257,8 +260,8 @@ def record(
     """Make the record from raw arrays and mark implausible points as missing.
 
     A point is missing if `present` is False, or if it is a placeholder such as (0, 0) or (-1, -1). It is missing too if
-    x, y or its confidence is not finite, or if x or y is beyond MAX_PIXELS. Confidences are clipped to 0..1: peaks of some detectors
-    exceed one slightly. Confidences far outside are noted.
+    x, y or its confidence is not finite, or if x or y is beyond MAX_PIXELS. Confidences are clipped to 0..1: peaks of
+    some detectors exceed one slightly. Confidences far outside are noted.
 
     Args:
         xy: (N, P, 2) pixels, any real type.
@@ -268,27 +271,34 @@ def record(
         present: (N, P) bool, or None if the family marks missing points by their values only.
         placeholders: whether (0, 0), (-1, -1) and the like are missing; False if the family has a mark of its own.
     """
-    xy = as_float64(xy)
+    # Damaged bytes may hold signalling NaN, of which numpy warns.
     with np.errstate(invalid="ignore"):
-        visible = (np.abs(xy) <= MAX_PIXELS).all(axis=-1)
-    if placeholders:
-        visible &= ~is_placeholder(xy[..., 0], xy[..., 1])
+        xy = np.array(xy, dtype=np.float64)
+        given = None if confidence is None else np.array(confidence, dtype=np.float64)
+        near = np.abs(xy) <= MAX_PIXELS
+        x, y, visible = xy[..., 0], xy[..., 1], near[..., 0] & near[..., 1]
+        # Two numbers are seldom equal; most images need one comparison only.
+        if placeholders and np.count_nonzero(x == y):
+            visible &= ~is_placeholder(x, y)
     if present is not None:
         visible &= present
     notes: tuple[Note, ...] = ()
-    if confidence is None:
+    if given is None:
         confidence = visible.astype(np.float64)
     else:
-        given = as_float64(confidence)
         visible &= np.isfinite(given)
         confidence = np.where(visible, given, 0.0)
-        clipped = np.clip(confidence, 0.0, 1.0)
-        # -1 alone marks a point without confidence.
-        if ((np.abs(confidence - clipped) > CONFIDENCE_SLACK) & (confidence != -1)).any():
-            notes = (_confidence_note(confidence),)
-        confidence = clipped
+        if np.count_nonzero((confidence < 0) | (confidence > 1)):
+            confidence, notes = _clipped(confidence)
     xy[~visible] = np.nan
     return Keypoints2D(xy, confidence, visible, ids, stamp_ns(header), str(header.frame_id), notes)
+
+
+def _clipped(confidence: np.ndarray) -> tuple[np.ndarray, tuple[Note, ...]]:
+    """Return confidences clipped to 0..1, and a note if some are far outside; -1 marks a point without confidence."""
+    clipped = np.clip(confidence, 0.0, 1.0)
+    outside = (np.abs(confidence - clipped) > CONFIDENCE_SLACK) & (confidence != -1)
+    return clipped, (_confidence_note(confidence),) if outside.any() else ()
 
 
 def _confidence_note(confidence: np.ndarray) -> Note:

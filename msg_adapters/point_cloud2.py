@@ -45,8 +45,9 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
         return no_persons(points, msg.header)
     # Check sizes first: numpy cannot make a structured type with an absurd point_step.
     row_step = _row_step(msg)
-    confidence_name = _confidence_name(msg)
-    dtype = _point_type(msg, confidence_name)
+    fields = {field.name: field for field in msg.fields}
+    confidence_name = next((name for name in _CONFIDENCE_NAMES if name in fields), None)
+    dtype = _point_type(msg, fields, confidence_name)
     cloud: np.ndarray = np.ndarray((msg.height, msg.width), dtype, buffer=msg.data, strides=(row_step, msg.point_step))
     cloud = _persons_first(cloud, points, source)
     names = dtype.names or ()
@@ -59,12 +60,6 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     return replace(keypoints, notes=(*keypoints.notes, _unused(msg, names)))
 
 
-def _confidence_name(msg: Any) -> str | None:
-    """Return the name of the field that holds the confidences, or None."""
-    fields = {field.name for field in msg.fields}
-    return next((name for name in _CONFIDENCE_NAMES if name in fields), None)
-
-
 def _unused(msg: Any, used: tuple[str, ...]) -> Note:
     unused = [field.name for field in msg.fields if field.name not in used]
     return Note(
@@ -74,9 +69,8 @@ def _unused(msg: Any, used: tuple[str, ...]) -> Note:
     )
 
 
-def _point_type(msg: Any, confidence_name: str | None) -> np.dtype:
+def _point_type(msg: Any, fields: dict[str, Any], confidence_name: str | None) -> np.dtype:
     """Return the structured type of one point with the needed fields only, at the message's offsets."""
-    fields = {field.name: field for field in msg.fields}
     if "x" not in fields or "y" not in fields:
         raise MessageError(
             "wrong_fields",
@@ -146,12 +140,29 @@ def _persons_first(cloud: np.ndarray, points: int, source: Source) -> np.ndarray
     """Return the (height, width) cloud as (persons, points)."""
     height, width = cloud.shape
     if height == 1:
-        return cloud.reshape(split_persons(width, points, source), points)
+        # While the layout is unknown, ids may show the number of persons.
+        persons = _persons_by_id(cloud[0]) if source.candidates else 1
+        if persons > 1 and persons * points != width:
+            raise WrongPointCount(
+                f"the cloud has {width} keypoints of {persons} persons, the layout {points} for each",
+                lambda other: other * persons == width,
+            )
+        return cloud.reshape(persons if persons > 1 else split_persons(width, points, source), points)
     if width != points:
         raise WrongPointCount(
             f"the cloud has {width} keypoints per person (its width), the layout {points}", lambda other: other == width
         )
     return cloud
+
+
+def _persons_by_id(points: np.ndarray) -> int:
+    """Return the number of persons in a list of points, if their ids divide it into equal parts, else 1."""
+    if "person_id" not in (points.dtype.names or ()):
+        return 1
+    column = as_float64(points["person_id"])
+    parts = np.split(column, np.flatnonzero(column[1:] != column[:-1]) + 1)
+    named = np.isfinite(column).all() and len({float(part[0]) for part in parts}) == len(parts)
+    return len(parts) if named and len({*map(len, parts)}) == 1 else 1
 
 
 def _ids(column: np.ndarray) -> tuple[str, ...]:

@@ -327,6 +327,24 @@ def test_a_list_of_one_person_and_rows_of_persons_are_read_while_the_layout_is_u
     assert read(CLOUD, cloud_of(make, xy_columns(some_points(4))), P, source).persons == 4
 
 
+@pytest.mark.parametrize(
+    "ids, persons",
+    [([4, 4, 4, 4, 4, 2, 2, 2, 2, 2], 2), ([0] * 10, 0), ([1, 1, 1, 2, 2, 2, 2, 2, 2, 2], 0), ([np.nan] * 10, 0),
+     ([1, 1, 1, 1, 1, 2, 2, 2, 2, np.nan], 0), ([1, 2] * 5, 0)],
+)  # fmt: skip
+def test_ids_show_the_number_of_persons_in_a_list(make, ids, persons):
+    """Ids that are all 0, as of some trackers, show nothing."""
+    columns = {**xy_columns(np.random.default_rng(0).uniform(9, 500, (1, 10, 2))), "person_id": np.array([ids])}
+    msg, source = cloud_of(make, columns), Source(candidates=(P, 10))
+    if persons:
+        assert read(CLOUD, msg, P, source).ids == ("4", "2")
+        with pytest.raises(WrongPointCount, match="10 keypoints of 2 persons"):
+            read(CLOUD, msg, 10, source)
+    else:
+        with pytest.raises(UnknownLayout):
+            read(CLOUD, msg, P, source)
+
+
 # --- numbers that mean something else
 
 
