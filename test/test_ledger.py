@@ -15,7 +15,7 @@ from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.reasons import DROP, NOTE, PERSON, REASONS
 
 #: Calls whose first argument is a reason.
-CALLS = {"MessageError", "drop", "note"}
+CALLS = {"MessageError", "Note", "drop", "note"}
 
 
 def test_drops_and_notes_are_counted_with_the_latest_advice():
@@ -76,7 +76,8 @@ def test_kinds_follow_the_use():
     noted = set()
     for path in sources():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "note":
+            name = getattr(node.func, "attr", getattr(node.func, "id", "")) if isinstance(node, ast.Call) else ""
+            if name in ("Note", "note") and isinstance(node.args[0], ast.Constant):
                 noted.add(node.args[0].value)
     assert noted == {slug for slug, reason in REASONS.items() if reason.kind == NOTE}
     assert OF_PERSONS == {slug for slug, reason in REASONS.items() if reason.kind == PERSON}

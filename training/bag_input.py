@@ -15,8 +15,15 @@ from training.data import RawFrames
 from training.errors import DataError
 
 
-def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: float) -> RawFrames:
+def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: float, guessed: bool) -> RawFrames:
     """Read the keypoints of a bag; see ``load_training_data``.
+
+    Args:
+        path: of the bag.
+        layout: of the points.
+        topic: that is read, with * for any part of a name; None reads all.
+        min_confidence: points of a lower one are hidden.
+        guessed: nobody named the layout, so a plain list of points is one person until a message shows that.
 
     Raises:
         MissingPackageError: the packages that read bags are missing.
@@ -25,7 +32,8 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
     """
     require("train", "mcap", "rosbags")
     camera, image_size, rejections = _bag_camera(path)
-    frames = _bag_keypoints(path, layout, topic, image_size, rejections)
+    refused: dict[str, tuple[int, str]] = {}
+    frames = _bag_keypoints(path, layout, topic, image_size, rejections, refused, guessed)
     if not frames:
         _check_topic(path, topic)
         raise DataError(
@@ -37,10 +45,14 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
     (messages,) = frames.values()
     xy = np.concatenate([message.xy for message in messages])
     visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for message in messages])
+    notes = tuple(
+        f"{count} messages left out, {reason}; of the last: {why}" for reason, (count, why) in refused.items()
+    )
     if camera is None:
-        return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False)
+        return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False, notes=notes)
     some = visible.any(1)
-    return RawFrames(centred_view(xy[some], visible[some], camera).W, visible[some], layout, calibrated=True)
+    W = centred_view(xy[some], visible[some], camera).W
+    return RawFrames(W, visible[some], layout, calibrated=True, notes=notes)
 
 
 def _check_topic(path: Path, topic: str | None) -> None:
@@ -60,6 +72,8 @@ def _bag_keypoints(
     topic: str | None,
     image_size: tuple[int, int] | None,
     rejections: dict[str, str],
+    refused: dict[str, tuple[int, str]],
+    guessed: bool,
 ) -> dict[str, list[msg_adapters.Keypoints2D]]:
     """Return keypoint messages by topic.
 
@@ -69,6 +83,8 @@ def _bag_keypoints(
         topic: that is read, with * for any part of a name; None reads all.
         image_size: width and height in pixels, if known.
         rejections: is given the last reason for which messages of a topic were rejected.
+        refused: is given the number of rejected messages by reason, and the last text.
+        guessed: see ``read_bag``.
     """
     from paul_ros.offline.bag_reader import matches, read_records
 
@@ -77,11 +93,13 @@ def _bag_keypoints(
         name, type_name = record.topic, record.type_name
         if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
             continue
-        source = msg_adapters.Source(layout.names, image_size, name)
+        candidates = (len(layout.names),) if guessed and not frames else ()
+        source = msg_adapters.Source(layout.names, image_size, name, candidates=candidates)
         try:
             keypoints = msg_adapters.read(type_name, record.message(), len(layout.names), source)
         except msg_adapters.MessageError as error:
             rejections[name] = str(error)
+            refused[error.reason] = refused.get(error.reason, (0, ""))[0] + 1, str(error)
         else:
             if keypoints.persons:
                 frames.setdefault(topic or name, []).append(keypoints)

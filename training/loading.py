@@ -44,5 +44,5 @@ def load_training_data(
         raise DataError(f"{path}: no such file or folder")
     if path.suffix == ".npz":
         return checked(read_arrays(path, layout), path, guessed=layout is None)
-    layout = layout or load_layout(DEFAULT_LAYOUT)
-    return checked(read_bag(path, layout, topic, min_confidence), path, guessed=False)
+    named = layout or load_layout(DEFAULT_LAYOUT)
+    return checked(read_bag(path, named, topic, min_confidence, guessed=layout is None), path, guessed=False)

@@ -21,6 +21,7 @@ from msg_adapters.keypoints import stamp_ns
 from paul_ros.errors import BagError, WrongTopicError
 from paul_ros.layout import Layout
 from paul_ros.lifted import Lifted
+from paul_ros.offline import truth_units
 from paul_ros.offline.bag_reader import matches, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages, Record
 from paul_ros.offline.bag_writer import LATCHED_QOS, BagWriter
@@ -200,6 +201,9 @@ class _OfflineNode:
         self._take_frame(self.done.stream.flush())
         for stamp, flat in self._flat_truth.items():
             self._map_truth(stamp, flat)
+        if problem := truth_units.problem(self.done):
+            self.done.stream.ledger.drop("truth_not_metres", problem, len(self.done.truth))
+            self.done.truth.clear()
 
     def _decode(self, record: Record, role: str, take: Callable[[Any], None], *readable: str) -> None:
         """Decode a record for `take`; count undecodable bytes as a drop.

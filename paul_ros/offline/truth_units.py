@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The unit of a ground truth, judged by its size: truth in millimetres or pixels must not pass for metres."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from paul_ros.lifted import MAX_DISTANCE
+
+if TYPE_CHECKING:
+    from paul_ros.offline.replay import Replay
+
+_FACTOR = 8.0
+"""Ratio of the sizes of truth and lifted persons beyond which their units differ. Children are not that small."""
+
+_LEAST_POINTS = 4
+"""Fewest points with a ground truth by which a person's size is judged."""
+
+_UNITS = ((1000.0, "millimetres"), (100.0, "centimetres or pixels"))
+
+
+def problem(done: Replay) -> str:
+    """Return why the ground truth of a replay is not in metres; '' if it may be."""
+    ratio = _ratio(done)
+    if not 0 < ratio or 1 / _FACTOR <= ratio <= _FACTOR:
+        return ""
+    guess = next((f" It looks like {name}." for size, name in _UNITS if size / 3 < ratio < 3 * size), "")
+    return (
+        f"The ground truth is {ratio:.3g} times as large as the persons that were lifted.{guess} Record it in metres, "
+        "in the frame of the camera."
+    )
+
+
+def _ratio(done: Replay) -> float:
+    """Return the median size of the truth over that of the lifted persons in metres; 1 if either is unknown."""
+    metres = done.stream.lifter.metres_per_unit
+    ratios = []
+    for frame in done.frames:
+        lifted, truth = frame.lifted, done.truth.get(frame.stamp)
+        if truth is None or len(truth) != len(lifted.points):
+            continue
+        unit = 1.0 if lifted.units == "m" else metres
+        for points, true in zip(lifted.points[lifted.ok], truth[lifted.ok]):
+            known = np.isfinite(true).all(1)
+            if known.sum() >= _LEAST_POINTS:
+                ratios.append(_size_ratio(true[known], points[known], unit))
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def _size_ratio(true: np.ndarray, points: np.ndarray, unit: float | None) -> float:
+    """Return the size of true points over that of lifted points (P,3), `unit` metres each."""
+    size = unit * _extent(points) if unit else 0.0
+    if size > 0:
+        return _extent(true) / size
+    # Without metres only an absurd size shows another unit.
+    return max(1.0, _FACTOR * _extent(true) / MAX_DISTANCE)
+
+
+def _extent(points: np.ndarray) -> float:
+    """Return the largest extent of points (P,3) along an axis."""
+    return float(np.ptp(points, axis=0).max())
