@@ -57,7 +57,7 @@ class DepthBuffer:
             stamp: of their keypoints, nanoseconds.
             camera: intrinsics of their image.
             surface: metres from the measured surface to the root.
-            ledger: notes how many depths were used and ignored, and images that cannot be used.
+            ledger: notes how many depths were used and ignored, by their reasons, and images that cannot be used.
         """
         image = min(self._images, key=lambda image: abs(image.stamp - stamp), default=None)
         if image is None or camera is None or lifted.units != "m" or not lifted.ok.any():
@@ -72,9 +72,12 @@ class DepthBuffer:
         factor = depth / lifted.root[:, 2]
         known = np.isfinite(factor)
         with np.errstate(invalid="ignore"):
-            used = known & (factor >= SIZES[0]) & (factor <= SIZES[1])
+            used = known & _is_possible(factor)
+            # No person is a thousand times as large as the model's: such a depth is right in another unit.
+            millimetres = known & _is_possible(factor / 1000)
         ledger.note("depth_used", count=int(used.sum()))
-        ledger.note("depth_disagrees", count=int((known & ~used).sum()))
+        ledger.note("depth_disagrees", REASONS["depth_disagrees"].advice, int((known & ~used & ~millimetres).sum()))
+        ledger.note("depth_in_millimetres", REASONS["depth_in_millimetres"].advice, int(millimetres.sum()))
         factor = np.where(used, factor, 1.0)
         return replace(
             lifted,
@@ -82,6 +85,11 @@ class DepthBuffer:
             root=lifted.root * factor[:, None],
             distance_sigma=np.where(used, SIGMA, lifted.distance_sigma),
         )
+
+
+def _is_possible(factor: np.ndarray) -> np.ndarray:
+    """Return which sizes over the model's size people can have."""
+    return (factor >= SIZES[0]) & (factor <= SIZES[1])
 
 
 def _measured(image: DepthImage, root: np.ndarray, camera: Intrinsics) -> float:
