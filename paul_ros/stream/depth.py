@@ -28,6 +28,7 @@ skin of a person who stands sideways. Clothes and arms before the hips add to it
 SIZES = (0.4, 1.4)
 """Limits of a person's size over the model's size. A depth that implies another size is ignored."""
 
+_NOWHERE = 100.0  # metres; an image with a person in it that begins beyond this holds millimetres
 _WINDOW = 0.04  # metres, half the side of the window
 _NEAR = 20_000_000  # ns between the stamps of an image and its depths
 _SET_BACK = 10**9  # ns
@@ -72,12 +73,14 @@ class DepthBuffer:
         factor = depth / lifted.root[:, 2]
         known = np.isfinite(factor)
         with np.errstate(invalid="ignore"):
-            used = known & _is_possible(factor)
-            # No person is a thousand times as large as the model's: such a depth is right in another unit.
-            millimetres = known & _is_possible(factor / 1000)
+            used = known & (factor >= SIZES[0]) & (factor <= SIZES[1])
+            too_far = bool((factor > SIZES[1]).any())
         ledger.note("depth_used", count=int(used.sum()))
-        ledger.note("depth_disagrees", REASONS["depth_disagrees"].advice, int((known & ~used & ~millimetres).sum()))
-        ledger.note("depth_in_millimetres", REASONS["depth_in_millimetres"].advice, int(millimetres.sum()))
+        ignored = int((known & ~used).sum())
+        if too_far and image.nearest() > _NOWHERE:
+            ledger.note("depth_in_millimetres", REASONS["depth_in_millimetres"].advice, ignored)
+        else:
+            ledger.note("depth_disagrees", REASONS["depth_disagrees"].advice, ignored)
         factor = np.where(used, factor, 1.0)
         return replace(
             lifted,
@@ -85,11 +88,6 @@ class DepthBuffer:
             root=lifted.root * factor[:, None],
             distance_sigma=np.where(used, SIGMA, lifted.distance_sigma),
         )
-
-
-def _is_possible(factor: np.ndarray) -> np.ndarray:
-    """Return which sizes over the model's size people can have."""
-    return (factor >= SIZES[0]) & (factor <= SIZES[1])
 
 
 def _measured(image: DepthImage, root: np.ndarray, camera: Intrinsics) -> float:
