@@ -77,10 +77,16 @@ def test_a_publisher_whose_qos_does_not_match_is_named(ros, started):
 
     bench = started("-r", "keypoints:=/loud", "-p", "qos_overrides./loud.subscription.reliability:=reliable")
     best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/loud", best_effort)
+    publisher = bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/loud", best_effort)
     bench.until(lambda: "publisher of /loud" in bench.lifter.log(), "the warning")
     assert "RELIABILITY" in bench.lifter.log() and "qos_overrides./loud.subscription.reliability" in bench.lifter.log()
-    bench.until(lambda: any("QoS" in status.message for _, status in bench.got["diagnostics"]), "the diagnostics")
+    bench.until(lambda: "QoS" in bench.next_diagnostics().message, "the diagnostics")
+    for _ in range(3):
+        status = bench.next_diagnostics()
+        assert status.level == b"\x01" and "publisher of /loud" in status.message and "RELIABILITY" in status.message
+    bench.node.destroy_publisher(publisher)
+    bench.until(lambda: "QoS" not in bench.next_diagnostics().message, "the end of the mismatch")
+    assert bench.lifter.log().count("publisher of /loud") == 1
 
 
 def test_a_subscriber_whose_qos_does_not_match_is_named_and_the_override_helps(started):
@@ -130,6 +136,23 @@ def test_an_input_type_that_is_not_the_published_one_is_an_error(started):
     bench.until(lambda: warning in bench.lifter.log(), "the warning")
     bench.until(lambda: warning in bench.next_diagnostics().message, "the diagnostics")
     assert bench.next_diagnostics().level == b"\x02"
+
+
+def test_simulated_time_without_a_clock_is_named(started):
+    """Frames are lifted all the same, and the warning ends with the first publisher of /clock."""
+    bench = started("-p", "use_sim_time:=true")
+    bench.matched()
+    bench.lifts()
+    warning = "use_sim_time is true, but nobody publishes /clock"
+
+    def last():
+        return bench.got["diagnostics"][-1][1]  # all stamps are zero
+
+    bench.until(lambda: bench.got["diagnostics"] and warning in last().message, "the diagnostics")
+    assert last().level != b"\x00"
+    bench.node.create_publisher(class_of("rosgraph_msgs/msg/Clock"), "/clock", 10)
+    bench.until(lambda: warning not in last().message, "a clock")
+    assert bench.lifter.log().count(warning) == 1 and "--clock" in bench.lifter.log()
 
 
 def test_simulated_time_that_is_set_back(started):

@@ -270,7 +270,7 @@ def test_another_layout_of_as_many_points_is_reported(bag, tmp_path):
     assert not right["noted"] and "noted" not in table(right)
     assert wrong["noted"]["unlike_the_model"] > 0.9 * wrong["lifted"] > 50
     noted = next(line for line in table(wrong).splitlines() if "noted" in line)
-    assert "layout 'h36m17'" in noted and "set `layout` (paul: --layout)" in noted
+    assert "layout 'h36m17'" in noted and "set `layout` to" in noted
 
 
 def test_no_person_at_all(model_file, tmp_path):

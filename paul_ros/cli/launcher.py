@@ -11,6 +11,7 @@ import sys
 from collections.abc import Collection
 
 from paul_ros import __version__
+from paul_ros.cli.advice import in_options
 from paul_ros.cli.options import HelpFormatter
 from paul_ros.cli.parser import Parser
 
@@ -64,6 +65,7 @@ def main(argv: list[str] | None = None) -> int:
 def _run(argv: list[str]) -> int:
     if argv[:1] != [_OWN_THREADS]:
         _use_one_thread()
+    args = argparse.Namespace()
     try:
         parser = build_parser(argv)
         args = parser.parse_args(argv)
@@ -76,7 +78,7 @@ def _run(argv: list[str]) -> int:
     except Exception as error:
         if not _is_expected(error):
             raise
-        print(f"paul: {' '.join(_text(error).split())}", file=sys.stderr)
+        print(f"paul: {' '.join(in_options(_text(error), vars(args)).split())}", file=sys.stderr)
         return 1
     return 0
 
