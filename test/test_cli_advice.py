@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from paul_ros.cli.advice import in_options
+from paul_ros.cli.advice import TOPICS, in_options
 from paul_ros.cli.launcher import build_parser
 from paul_ros.errors import PaulError
 from paul_ros.stream.parameters import DEFAULTS, checked
@@ -16,7 +16,6 @@ from paul_ros.stream.reasons import REASONS
 REPLAY = vars(build_parser(["replay"]).parse_args(["replay", "BAG"]))
 LIFT = vars(build_parser(["lift"]).parse_args(["lift", "IN", "-o", "OUT"]))
 OPTIONS = {f"--{name.replace('_', '-')}" for name in REPLAY}
-TOPICS = ("keypoints", "camera_info", "depth")
 
 
 @pytest.mark.parametrize(

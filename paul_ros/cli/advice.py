@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-_TOPICS = {"keypoints": "topic", "camera_info": "camera_info_topic", "depth": "depth_topic"}
+TOPICS = {"keypoints": "topic", "camera_info": "camera_info_topic", "depth": "depth_topic"}
 """Topic of the node -> name of the option that chooses it in a bag."""
 
 _NAME = re.compile(r"(?P<remap>[Rr]emap )?(?:the parameter )?`(?P<name>\w+)`")
@@ -26,12 +26,12 @@ def in_options(advice: str, arguments: Mapping[str, Any]) -> str:
 
     def replaced(match: re.Match[str]) -> str:
         remap, name = match["remap"] or "", match["name"]
-        argument = _TOPICS.get(name, name)
-        if argument not in arguments or (name not in _TOPICS and name not in DEFAULTS):
+        argument = TOPICS.get(name, name)
+        if argument not in arguments or (name not in TOPICS and name not in DEFAULTS):
             return match[0]
         option = f"--{argument.replace('_', '-')}"
         if remap:
             return f"{'Set' if remap[0] == 'R' else 'set'} {option}"
-        return f"the topic of {option}" if name in _TOPICS else option
+        return f"the topic of {option}" if name in TOPICS else option
 
     return _NAME.sub(replaced, advice)

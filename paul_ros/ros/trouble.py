@@ -16,7 +16,7 @@ from paul_ros.ros.advisor import SILENT_SECONDS
 
 
 class Trouble:
-    """What is wrong around a node, until it is mended."""
+    """Faults in the surroundings of a node, each until it is mended."""
 
     def __init__(self, node: Node) -> None:
         """Begin to watch."""
@@ -29,7 +29,7 @@ class Trouble:
         self._qos_warnings[topic] = warning
 
     def sentences(self) -> list[str]:
-        """Return what is wrong, a sentence each with what to do. A mismatch of QoS is returned once at least."""
+        """Return a sentence on each fault, with what to do. A mismatch of QoS is returned once at least."""
         found = [*self._qos_warnings.values(), *self._missing_clock()]
         self._qos_warnings = {
             topic: warning for topic, warning in self._qos_warnings.items() if self._is_mismatched(topic)

@@ -59,7 +59,7 @@ class Reason:
 
     @property
     def unit(self) -> str:
-        """What the share is of: "persons" or "messages"."""
+        """The whole that the share is taken of: "persons" or "messages"."""
         return "persons" if self.counts_persons or self.kind == PERSON else "messages"
 
     @property
