@@ -6,9 +6,10 @@ from __future__ import annotations
 import re
 import time
 
+import numpy as np
 import pytest
-from conftest import camera_info
-from node_bench import MAKE, Bench, class_of, good, set_parameters
+from conftest import camera_info, seen
+from node_bench import GOOD, MAKE, Bench, class_of, cloud, good, set_parameters
 
 
 @pytest.fixture
@@ -51,6 +52,25 @@ def test_levels_from_the_first_to_the_last_frame(started):
     assert values["latency_ms_median"] == "unknown"  # the stamps of these tests follow no clock
     bench.until(lambda: bench.got["diagnostics"][-1][1].level == DiagnosticStatus.STALE, "level STALE")
     assert re.search(r"No keypoints for \d+ s on /", bench.lifter.log())
+
+
+def test_a_person_at_the_edge_of_the_image_is_counted_and_no_warning(started):
+    """It walks in for half a second, stays for two, and walks out for half a second, twice."""
+    bench = started()
+    bench.matched()
+    bench.camera.publish(camera_info(MAKE))
+    bench.until(lambda: bench.units() == "m", "metres")
+    bench.until(lambda: bench.next_diagnostics().level == b"\x00", "level OK")
+    edge = seen(GOOD)
+    edge[:, 3:] = np.nan
+    begin = len(bench.got["diagnostics"])
+    for pixels in 2 * (5 * [edge] + 20 * [seen(GOOD)] + 5 * [edge]):
+        bench.send(cloud(pixels))
+        end = time.monotonic() + 0.1
+        bench.until(lambda end=end: time.monotonic() >= end, "a tenth of a second")
+    levels = {status.level for _, status in bench.got["diagnostics"][begin:]}
+    assert levels == {b"\x00"} and int(bench.diagnosed()["dropped_person_too_few_points"]) == 20
+    assert "person_too_few_points" not in bench.lifter.log()
 
 
 def test_latency_is_from_stamp_to_publish(started):
