@@ -37,8 +37,8 @@ def table(report: dict) -> str:
     for row in report["rows"]:
         ratio = ratios.get((row["persons"], row["rate_hz"])) if row["node"] == "lifter" else None
         shown = {**row, **(ratio or {})}
-        why = f"{row['persons']} persons at {row['rate_hz']:g} Hz: a node answered no message"
-        rows.append([figure(shown[key], why) for *_, key in _COLUMNS if key in shown])
+        name = f"{row['persons']} persons at {row['rate_hz']:g} Hz"
+        rows.append([figure(shown[key], name, "a node answered no message") for *_, key in _COLUMNS if key in shown])
     starts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["start_to_first_output_s"].items())
     machine = report["machine"]
     lines = [

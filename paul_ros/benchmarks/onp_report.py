@@ -32,11 +32,11 @@ _COLUMNS = (
 """Heading, kind and key."""
 
 _WHY_MISSING = {
-    "certified_percent": "cert. %, wrong: only the method ours has a certificate",
-    "certified_wrong": "cert. %, wrong: only the method ours has a certificate",
-    "better_than_ours": "better: it compares the other methods with ours",
-    "us_batch": "µs batch: lm_search is too slow for a batch",
-    "batch_over_lsq": "µs batch: lm_search is too slow for a batch",
+    "certified_percent": ("cert. %", "only the method ours has a certificate"),
+    "certified_wrong": ("wrong", "only the method ours has a certificate"),
+    "better_than_ours": ("better", "it compares the other methods with ours"),
+    "us_batch": ("µs batch", "lm_search is too slow for a batch"),
+    "batch_over_lsq": ("µs batch", "lm_search is too slow for a batch"),
 }
 
 
@@ -69,7 +69,7 @@ def _cells(row: dict, lsq: dict) -> Row:
         "single_over_lsq": single and single / lsq["us_single"],
         "batch_over_lsq": batch and batch / lsq["us_batch"],
     }
-    return [figure(shown[key], _WHY_MISSING.get(key, "")) for *_, key in _COLUMNS]
+    return [figure(shown[key], *_WHY_MISSING.get(key, (key, ""))) for *_, key in _COLUMNS]
 
 
 def _shape_table(scenarios: dict[str, dict[str, dict]]) -> str:

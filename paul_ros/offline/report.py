@@ -53,19 +53,18 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
 def _errors(report: dict, name: str, key: str) -> tuple[Cell, Cell]:
     """Return an error of the lifted persons and of the rigid mean shape."""
     if report["units"] == "m":
-        why = f"{name}: the ground truth has no root, or persons were lifted before the first CameraInfo"
+        why = "the ground truth has no root, or persons were lifted before the first CameraInfo"
     else:
-        why = f"{name}: it needs metres; {report['scale_source'].removeprefix('none: ')}"
-    return figure(report[key], why), figure(report["baseline"][key], why)
+        why = f"metres are needed; {report['scale_source'].removeprefix('none: ')}"
+    return figure(report[key], name, why), figure(report["baseline"][key], name, why)
 
 
 def _figures(report: dict) -> list[Row]:
     """Return the rows that need no truth: name, figure, "", unit."""
-    nobody = "{}: nobody was lifted"
-    flips = "{}: no person with an id was lifted in two successive frames; use tracked keypoints"
-    lift, lift_p99 = (
-        figure(report[key], "lift, median: no message shows a person") for key in ("lift_us_median", "lift_us_p99")
-    )
+    nobody = "nobody was lifted"
+    flips = "no person with an id was lifted in two successive frames; use tracked keypoints"
+    times = (report[key] for key in ("lift_us_median", "lift_us_p99"))
+    lift, lift_p99 = (figure(time, "lift, median", "no message shows a person") for time in times)
     rows = (
         ("reprojection, median", report["reprojection_median_px"], nobody, "px"),
         ("proven optimal", _percent(report["certified_share"]), nobody, "%"),
@@ -78,7 +77,7 @@ def _figures(report: dict) -> list[Row]:
         ),
     )
     return [
-        *((name, figure(value, why.format(name)), "", unit) for name, value, why, unit in rows),
+        *((name, figure(value, name, why), "", unit) for name, value, why, unit in rows),
         ("lift, median", lift, "", f"µs per frame (99 %: {cell(lift_p99)})"),
     ]
 

@@ -16,9 +16,11 @@ class Missing:
     """A cell without a figure: "-" in the table, and the reason below it.
 
     Attributes:
-        why: names the figure and says why it is missing, without a full stop.
+        name: of the figure.
+        why: why it is missing, without a full stop.
     """
 
+    name: str
     why: str
 
 
@@ -75,13 +77,16 @@ def render(columns: Sequence[tuple[str, str]], rows: Iterable[Row]) -> str:
     console.width = max(console.width, least)
     with console.capture() as captured:
         console.print(table, crop=False)
-    reasons = dict.fromkeys(value.why for row in rows for value in row if isinstance(value, Missing))
-    return "\n".join([line.rstrip() for line in captured.get().splitlines()] + [f" - {why}" for why in reasons])
+    missing: dict[str, dict[str, None]] = {}  # reason -> names, each once
+    for value in (value for row in rows for value in row if isinstance(value, Missing)):
+        missing.setdefault(value.why, {})[value.name] = None
+    reasons = [f" - {'; '.join(names)}: {why}" for why, names in missing.items()]
+    return "\n".join([*(line.rstrip() for line in captured.get().splitlines()), *reasons])
 
 
-def figure(value: str | float | None, why: str) -> Cell:
+def figure(value: str | float | None, name: str, why: str) -> Cell:
     """Return a figure of a report as a cell, which says why it is missing if it is None."""
-    return Missing(why) if value is None else value
+    return Missing(name, why) if value is None else value
 
 
 def cell(value: Cell, kind: str = ".1f") -> str:

@@ -219,7 +219,8 @@ _ALL = (
         "depth_disagrees",
         NOTE,
         "A depth implies an impossible size of the person and is ignored, as when something hides the hips",
-        "If it is counted for most persons, check that `depth` is aligned to the image of the keypoints.",
+        "If it is counted for most persons, check the unit of `depth`, and that it is aligned to the image of the "
+        "keypoints.",
         warn_above=MOST,
         counts_persons=True,
     ),

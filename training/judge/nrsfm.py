@@ -192,8 +192,12 @@ def bad_runs(row: dict[str, Any]) -> str:
 def _published_parts(figures: dict[str, dict[str, float]]) -> list[str]:
     """Return the table of the published figures; none if no sequence has any."""
     methods = list(dict.fromkeys(method for known in figures.values() for method in known))
-    why = "that method has no published figure of this sequence"
-    rows = [(name, *(figure(known.get(method), why) for method in methods)) for name, known in figures.items() if known]
+    why = "no figure is published"
+    rows = [
+        (name, *(figure(known.get(method), f"{method} of {name}", why) for method in methods))
+        for name, known in figures.items()
+        if known
+    ]
     columns = [("sequence", "text"), *((method, ".2f") for method in methods)]
     return [f"published\n{render(columns, rows)}"] if rows else []
 

@@ -97,7 +97,7 @@ class Sweep:
         for row in report["summary"]:
             name = row["sequence"] if row["sequence"] != last else ""
             last = row["sequence"]
-            ratio = figure(row["ratio"], f"ratio: no run is {self.reference}, or its median is 0")
+            ratio = figure(row["ratio"], "ratio", f"no run is {self.reference}, or its median is 0")
             figures = (row[f"{key}_ne_flip_frame_percent"] for key in _FIGURES)
             more = (bad_runs(row), row["median_ne_flip_global_percent"], ratio, row["seconds_median"])
             rows.append((name, self.format(row["value"]), *figures, *more))
