@@ -78,7 +78,8 @@ def parameters() -> str:
 
 def reasons() -> str:
     """Return a table for each kind of reason by which a message or person is dropped, or a note is made."""
-    from paul_ros.stream.reasons import DROP, NOTE, PERSON, REASONS
+    from paul_ros.stream.reason import DROP, NOTE, PERSON
+    from paul_ros.stream.reasons import REASONS
 
     titles = {
         DROP: "**Dropped messages**, `dropped_<reason>` in `/diagnostics`:",
@@ -87,9 +88,22 @@ def reasons() -> str:
     }
     tables = []
     for kind, title in titles.items():
-        rows = [(f"`{r.slug}`", f"{r.what}.", r.fix) for r in REASONS.values() if r.kind == kind]
-        tables.append(f"{title}\n\n{table(('reason', 'what happened', 'what to do'), rows)}")
+        rows = [(f"`{r.slug}`", f"{r.what}.", r.fix, r.warns) for r in REASONS.values() if r.kind == kind]
+        tables.append(f"{title}\n\n{table(('reason', 'what happened', 'what to do', 'WARN'), rows)}")
     return "\n".join(tables)
+
+
+def options() -> str:
+    """Return a table of the options of `paul replay` that stand for parameters and topics of the node."""
+    from paul_ros.cli.advice import TOPICS, in_options
+    from paul_ros.cli.launcher import build_parser
+    from paul_ros.stream.parameters import DEFAULTS
+
+    arguments = vars(build_parser(["replay"]).parse_args(["replay", "BAG"]))
+    kinds = {**dict.fromkeys(TOPICS, "topic"), **dict.fromkeys(DEFAULTS, "parameter")}
+    named = [(f"{kind} `{name}`", in_options(f"`{name}`", arguments)) for name, kind in kinds.items()]
+    rows = [(name, f"`--{option.partition('--')[2]}`") for name, option in named if "--" in option]
+    return table(("node", "`paul replay`"), rows)
 
 
 def layouts() -> str:
@@ -220,7 +234,8 @@ def table(head: tuple[str, ...], rows: list[tuple]) -> str:
 
 
 REGIONS: dict[str, Callable[[], str]] = {
-    function.__name__: function for function in (parameters, reasons, layouts, recipes, settings, views, commands)
+    function.__name__: function
+    for function in (parameters, reasons, options, layouts, recipes, settings, views, commands)
 }
 
 if __name__ == "__main__":

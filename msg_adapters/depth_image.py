@@ -48,6 +48,15 @@ class DepthImage:
             return np.nan
         return float(np.median(measured)) * self.metres
 
+    def nearest(self) -> float:
+        """Return the depth in metres that 95 % of the image lie beyond; NaN if nothing was measured.
+
+        One pixel in 64 is looked at.
+        """
+        some = self.values[::8, ::8]
+        measured = some[np.isfinite(some) & (some > 0)]
+        return float(np.percentile(measured, 5)) * self.metres if measured.size else np.nan
+
 
 def read_depth(msg: Any) -> DepthImage:
     """Read a depth image without a copy of its data.

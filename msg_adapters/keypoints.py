@@ -211,7 +211,7 @@ def _common(own: tuple[str, ...], names: tuple[str, ...]) -> tuple[np.ndarray, n
         raise MessageError(
             "no_common_names",
             f"the layout has none of the message's points ({', '.join(filter(None, own))}); "
-            "set `layout` (paul: --layout) to one of the same kind of object",
+            "set `layout` to one of the same kind of object",
         )
     here, there = np.array(pairs).T
     return here, there

@@ -47,8 +47,7 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
         named = ", ".join(keypoint.kpt_name for keypoint in msg.keypoint_list[:5])
         raise MessageError(
             "no_common_names",
-            f"the layout has none of the message's points ({named} ...); set `layout` (paul: --layout) to one "
-            "with the same names",
+            f"the layout has none of the message's points ({named} ...); set `layout` to one with the same names",
         )
     person = str(msg.pose_id) if msg.pose_id >= 0 else ""
     return record(xy, None, (person,), msg.header, present=np.all(xy >= 0, axis=-1), placeholders=False)

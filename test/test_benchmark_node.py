@@ -156,7 +156,8 @@ def test_a_node_that_answers_nothing_has_no_figures():
     rows = [silent, row("echo", 1, 30, [Turn(5, np.ones(5), 0.5)], 60.5)]
     assert set(ratios(rows)[0].values()) == {1, 30, None}
     head = {"start_to_first_output_s": {}, "machine": {"processor": "?", "cpus": 1, "load_before": 0, "load_after": 0}}
-    assert "-" in table({**head, "rows": rows, "ratios": ratios(rows)}).splitlines()[1]
+    shown = table({**head, "rows": rows, "ratios": ratios(rows)})
+    assert "-" in shown.splitlines()[1] and " - 1 persons at 30 Hz: a node answered no message" in shown
 
 
 def test_ratios_are_of_the_same_persons_and_rate():

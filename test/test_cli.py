@@ -65,7 +65,7 @@ def test_help_names_every_command(capsys):
 
 
 def test_every_module_of_a_command_is_a_command():
-    own = {"launcher", "options", "output", "parser", "progress"}
+    own = {"advice", "launcher", "options", "output", "parser", "progress"}
     files = {file.stem for file in (ROOT / "paul_ros" / "cli").glob("[a-z]*.py")} - own
     assert {name for name in files if not name.startswith("benchmark_")} == set(COMMANDS)
 
@@ -199,7 +199,7 @@ def test_replay(model_file, tmp_path):
 @pytest.mark.parametrize(
     "layout, shown, clue",
     [
-        ("human", 17, "Set `layout` (paul: --layout) to the one your detector uses: coco17, h36m17."),
+        ("human", 17, "Set --layout to the one your detector uses: coco17, h36m17."),
         ("coco17", 3, "too few of its keypoints are visible"),
         ("coco17", 17, ""),
     ],
@@ -236,8 +236,8 @@ def test_half_a_bag(model_file, tmp_path):
     [
         (["replay", "nowhere.mcap"], "nowhere.mcap: no such file or folder"),
         (["replay", ONE, "--model", "nobody"], "no model 'nobody'"),
-        (["replay", ONE, "--person-height", "9"], "person_height is 9.0; it must be 0 or 0.3 to 3.0"),
-        (["replay", ONE, "--person-height", "1e-9"], "person_height is 1e-09; it must be 0 or 0.3 to 3.0"),
+        (["replay", ONE, "--person-height", "9"], "--person-height is 9.0; it must be 0 or 0.3 to 3.0"),
+        (["replay", ONE, "--person-height", "1e-9"], "--person-height is 1e-09; it must be 0 or 0.3 to 3.0"),
         (["replay", ONE, "--smoothing", "nan"], "smoothing is nan"),
         (["replay", ONE, "--output-layout", "body25"], "has no left_big_toe"),
         (["replay", ONE, "--layout", "coco71"], "did you mean 'coco17'?"),

@@ -19,6 +19,10 @@ from paul_ros.stream.stream import LiftStream, open_stream
 CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
+#: A floor near the camera, and a plane at the far end of a simulator's view.
+FAR_BEHIND = np.where(np.arange(480)[:, None] < 420, 1000.0, 2.0) * np.ones((480, 640))
+
+
 def depth_image(make, metres: np.ndarray, encoding: str = "32FC1", big: bool = False, pad: int = 0, **changes):
     """Return (H,W) metres as a message with `pad` bytes after every row."""
     form, unit = ("f4", 1.0) if encoding == "32FC1" else ("u2", 0.001)
@@ -112,6 +116,10 @@ def test_persons_of_any_size_stand_where_they_are_measured(stream, make, scale):
         (np.full((480, 640), 30.0), {"depth_disagrees": 2}),
         (np.full((480, 640), np.nan), {}),
         (np.full((240, 320), 4.0), {"depth_of_another_size": 1}),
+        (np.full((480, 640), 4000.0), {"depth_in_millimetres": 2}),
+        (np.full((480, 640), 400.0), {"depth_in_millimetres": 2}),
+        (np.full((480, 640), 90.0), {"depth_disagrees": 2}),
+        (FAR_BEHIND, {"depth_disagrees": 2}),
     ],
 )
 def test_what_is_no_measure_of_the_person_changes_nothing(stream, make, metres, note):

@@ -8,7 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from paul_ros.ros.diagnostics import ERROR, OK, STALE, STALE_SECONDS, WARN, Health, percentiles
+from paul_ros.ros.diagnostics import ERROR, OK, QUIET_SECONDS, STALE, STALE_SECONDS, WARN, Health, percentiles
+from paul_ros.ros.recent_counts import LASTING, WINDOW
+from paul_ros.stream.reason import NOTE
+from paul_ros.stream.reasons import REASONS
 from paul_ros.stream.stream import open_stream
 
 S = 10**9  # ns
@@ -22,8 +25,8 @@ def stream(model_file):
 
 
 @pytest.fixture
-def health():
-    return Health(100.0)
+def health(stream):
+    return Health(100.0, stream)
 
 
 def frame(stamp: int = 0, certified=(True,), ambiguity=(0.5,)):
@@ -32,27 +35,29 @@ def frame(stamp: int = 0, certified=(True,), ambiguity=(0.5,)):
     return SimpleNamespace(keypoints=SimpleNamespace(stamp=stamp), lifted=lifted)
 
 
-def run(health, now: float = 101.0) -> None:
+def run(health, stream, now: float = 101.0) -> None:
     """One good frame."""
     health.received(now - 0.5)
     health.published(frame(), S)
+    stream.counts.update(frames=1, persons=1, lifted=1)
 
 
 def test_all_is_well(health, stream):
-    run(health)
+    run(health, stream)
     report = health.report(101.0, stream)
     assert (report.level, report.message) == (OK, "1 frames since the last report, units: m")
-    assert report.frames == 1 and report.silent_seconds == pytest.approx(0.5)
+    assert report.lifting and report.silent_seconds == pytest.approx(0.5)
 
 
 def test_nothing_yet_then_silence_then_stale(health, stream):
     assert health.report(101.0, stream).level == WARN
     never = health.report(102.0, stream)
     assert "no keypoints yet" in never.message and never.silent_seconds == 2
-    run(health, 103.0)
+    run(health, stream, 103.0)
     assert health.report(103.0, stream).level == OK
-    quiet = health.report(104.0, stream)
-    assert quiet.level == WARN and "no keypoints since" in quiet.message
+    assert health.report(102.5 + QUIET_SECONDS - 0.01, stream).level == OK, "as between images at 0.5 Hz"
+    quiet = health.report(102.5 + QUIET_SECONDS, stream)
+    assert quiet.level == WARN and "no keypoints for 2 s" in quiet.message
     assert health.report(102.5 + STALE_SECONDS - 0.01, stream).level == WARN
     stale = health.report(102.5 + STALE_SECONDS, stream)
     assert stale.level == STALE and "no keypoints for 5 s" in stale.message
@@ -60,17 +65,32 @@ def test_nothing_yet_then_silence_then_stale(health, stream):
 
 
 def test_an_input_that_cannot_be_read_is_an_error(health, stream):
-    run(health)
+    run(health, stream)
     report = health.report(101.0, stream, "no such package")
     assert (report.level, report.message) == (ERROR, "no such package")
 
 
-def test_a_fault_of_the_node_is_an_error(health, stream):
-    run(health)
-    stream.ledger.drop("internal_error", "a fault")
-    assert health.report(101.0, stream).level == ERROR
-    run(health, 102.0)
-    assert health.report(102.0, stream).level == OK
+def seconds(health, stream, begin: int, count: int, persons: int = 30, **reasons: int) -> str:
+    """Report `count` times, each after a second of 30 images with `persons` persons and these drops or notes.
+
+    Returns the levels as text: O, W, E or S.
+    """
+    levels = []
+    for second in range(begin, begin + count):
+        for _ in range(30):
+            health.received(101.0 + second)
+        health.published(frame(), S)
+        stream.counts.update(frames=30, persons=persons)
+        for reason, number in reasons.items():
+            is_note = reason in REASONS and REASONS[reason].kind == NOTE
+            (stream.ledger.note if is_note else stream.ledger.drop)(reason, f"advice on {reason}", number)
+        levels.append("OWES"[health.report(101.0 + second, stream).level])
+    return "".join(levels)
+
+
+def test_a_fault_of_the_node_is_an_error_for_a_while(health, stream):
+    assert seconds(health, stream, 0, 1, internal_error=1) == "E"
+    assert seconds(health, stream, 1, WINDOW) == "E" * (WINDOW - 1) + "O"
 
 
 def test_a_callback_that_failed_is_an_error_once(health, stream):
@@ -92,77 +112,126 @@ def test_an_unknown_parameter_is_a_value_and_no_warning(health, stream):
 
 
 def test_drops_are_a_warning_and_an_error_where_nothing_is_left(health, stream):
-    run(health)
+    run(health, stream)
     health.received(100.9)
     stream.ledger.drop("wrong_fields", "correct them")
     report = health.report(101.0, stream)
-    assert report.level == WARN and "dropped: 1 wrong_fields" in report.message
+    assert report.level == WARN and "dropped: 1 wrong_fields in the last 10 s" in report.message
     health.received(101.5)
     stream.ledger.drop("wrong_fields", "correct them")
     report = health.report(102.0, stream)
-    assert report.level == ERROR and "no message could be used; dropped: 1 wrong_fields" in report.message
+    assert report.level == ERROR and "no message could be used; dropped: 2 wrong_fields" in report.message
     assert report.values["dropped_wrong_fields"] == 2
 
 
 def test_drops_of_before_it_was_activated_are_old_news(stream):
     stream.ledger.drop("internal_error", "a fault", 2)
     stream.ledger.drop("not_2d", "send 2D", 3)
-    health = Health(100.0, stream.ledger.drops)
-    run(health)
+    health = Health(100.0, stream)
+    run(health, stream)
     report = health.report(101.0, stream)
-    assert report.level == OK and report.values["dropped_not_2d"] == 3
+    assert report.level == OK and report.values["dropped_not_2d"] == 3 and not report.warnings
     stream.ledger.drop("not_2d", "send 2D")
-    assert "dropped: 1 not_2d" in health.report(102.0, stream).message
+    report = health.report(102.0, stream)
+    assert "dropped: 1 not_2d" in report.message and [reason.slug for reason in report.warnings] == ["not_2d"]
 
 
-def test_notes_are_a_warning_as_long_as_they_are_counted(stream):
-    stream.ledger.note("another_frame", "another frame", 4)
-    stream.ledger.note("unlike_the_model", "hardly fit", 9)
-    health = Health(100.0, stream.ledger.drops, stream.ledger.notes)
-    run(health)
-    assert health.report(101.0, stream).level == OK
-    run(health, 104.0)
-    stream.ledger.note("another_frame", "another frame")
-    stream.ledger.note("unlike_the_model", "hardly fit")
-    report = health.report(104.0, stream)
-    assert report.level == WARN and report.message.startswith("another frame; hardly fit; 1 frames")
-    run(health, 105.0)
-    assert health.report(105.0, stream).level == OK
+@pytest.mark.parametrize(
+    "reason", ["not_2d", "another_frame", "depth_of_another_size", "bad_intrinsics", "of_a_plugin"]
+)
+def test_what_is_never_normal_is_a_warning_at_once_and_does_not_flicker(health, stream, reason):
+    """Whether it comes every second or every ninth; it ends when it has not come for WINDOW reports."""
+    levels = ""
+    for second in range(0, 36, 9):
+        levels += seconds(health, stream, second, 1, **{reason: 1}) + seconds(health, stream, second + 1, 8)
+    assert levels == 36 * "W"
+    assert seconds(health, stream, 36, 3) == "WOO"
 
 
-@pytest.mark.parametrize("persons, unlike, level", [(20, 9, OK), (20, 10, OK), (20, 11, WARN), (20, 20, WARN)])
-def test_persons_unlike_the_model_are_a_warning_if_they_are_most(health, stream, persons, unlike, level):
-    """Up to half of them may be misdetections. A person that was not lifted does not count."""
-    health.received(100.5)
-    health.published(frame(certified=(True,) * persons + (False,), ambiguity=(0.5,) * persons + (np.nan,)), S)
-    stream.ledger.note("unlike_the_model", "hardly fit", unlike)
-    assert health.report(101.0, stream).level == level
+@pytest.mark.parametrize(
+    "reason",
+    ["person_too_few_points", "person_degenerate_points", "person_too_far", "unlike_the_model", "depth_disagrees"],
+)
+def test_persons_at_the_edge_of_the_image_are_counted_and_no_warning(health, stream, reason):
+    """A person enters, is fully visible for five seconds, leaves, for half an hour; a second one comes and goes too."""
+    levels = ""
+    for second in range(0, 1800, 6):
+        levels += seconds(health, stream, second, 1, persons=15, **{reason: 15})
+        levels += seconds(health, stream, second + 1, 4, persons=60)
+        levels += seconds(health, stream, second + 5, 1, persons=0)
+    assert levels == 1800 * "O"
+    assert {**stream.ledger.drops, **stream.ledger.notes}[reason] == 300 * 15
+
+
+def test_persons_left_out_are_a_warning_if_they_are_most_for_a_while(health, stream):
+    assert seconds(health, stream, 0, LASTING, person_too_few_points=30) == (LASTING - 1) * "O" + "W"
+    assert seconds(health, stream, 20, 30, person_too_few_points=14) == 30 * "W", "it does not flicker at its limit"
+    assert seconds(health, stream, 60, 20, person_too_few_points=7).endswith("OOO")
+    assert seconds(health, stream, 80, 30, person_too_few_points=15) == 30 * "O", "half of them"
+
+
+def test_a_warning_of_persons_states_their_share(health, stream):
+    seconds(health, stream, 0, 9, persons=10, person_too_few_points=6)
+    for _ in range(2):
+        stream.ledger.drop("person_too_few_points", "", 3)
+        stream.counts.update(frames=30, persons=5)
+        health.received(110.0)
+        report = health.report(110.0, stream)
+    assert report.level == WARN
+    assert "dropped: 54 person_too_few_points (60 % of persons) in the last 10 s" in report.message
+    assert [reason.slug for reason in report.warnings] == ["person_too_few_points"]
+
+
+@pytest.mark.parametrize("lost, level", [(3, "O"), (4, "W")])
+def test_lost_messages_are_a_warning_above_a_tenth(health, stream, lost, level):
+    """3 of 33 and 4 of 34 messages."""
+    assert seconds(health, stream, 0, LASTING, missed=lost)[-1] == level
+    assert seconds(health, stream, LASTING, 1, missed=lost) == level
+
+
+def test_a_hiccup_that_loses_a_second_of_messages_is_no_warning(health, stream):
+    assert seconds(health, stream, 0, 1, missed=30) + seconds(health, stream, 1, 20) == 21 * "O"
+
+
+def test_notes_are_a_warning_as_long_as_they_are_recent(health, stream):
+    assert seconds(health, stream, 0, 1, another_frame=1, stamp_backwards=1, distorted_image=1) == "W"
+    report = health.report(102.0, stream)
+    assert report.message.startswith("advice on another_frame; 0 frames")
+    assert [reason.slug for reason in report.warnings] == ["another_frame", "distorted_image", "stamp_backwards"]
+    assert seconds(health, stream, 2, WINDOW)[-2:] == "OO"
+
+
+@pytest.mark.parametrize("unlike, level", [(15, OK), (16, WARN), (30, WARN)])
+def test_persons_unlike_the_model_are_a_warning_if_they_are_most(health, stream, unlike, level):
+    """Up to half of them may be misdetections."""
+    assert seconds(health, stream, 0, LASTING, unlike_the_model=unlike)[-1] == "OW"[level]
 
 
 def test_a_person_left_out_or_a_message_lost_is_no_error(health, stream):
     health.received(100.5)  # it waits for the rest of its image
     stream.ledger.drop("missed", "lost", 3)
     stream.ledger.drop("person_too_few_points", "left out", 2)
-    assert health.report(101.0, stream).level == WARN
+    assert health.report(101.0, stream).level == OK
 
 
-def test_a_qos_that_does_not_match_is_a_warning_once(health, stream):
-    run(health)
-    health.qos_mismatch()
-    report = health.report(101.0, stream)
-    assert report.level == WARN and "QoS" in report.message
-    run(health, 102.0)
+def test_trouble_around_the_node_is_a_warning_as_long_as_it_lasts(health, stream):
+    run(health, stream)
+    report = health.report(101.0, stream, trouble=["A publisher of /a does not match."])
+    assert report.level == WARN and report.message.startswith("A publisher of /a does not match; 1 frames")
+    run(health, stream, 102.0)
     assert health.report(102.0, stream).level == OK
+    stale = health.report(110.0, stream, trouble=["A publisher of /a does not match."])
+    assert stale.level == STALE and "A publisher of /a" in stale.message
 
 
 def test_model_units_are_a_warning_where_the_model_knows_metres(health, stream):
     stream.session.intrinsics = None
     assert "no metres" not in health.report(100.5, stream).message, "before a frame was lifted"
-    run(health)
+    run(health, stream)
     report = health.report(101.0, stream)
     assert report.level == WARN and "no metres" in report.message
     stream.lifter.metres_per_unit = None
-    run(health, 102.0)
+    run(health, stream, 102.0)
     assert health.report(102.0, stream).level == OK
 
 

@@ -259,7 +259,8 @@ def test_the_keys_of_a_layout_file_are_those_documented() -> None:
 
 
 def test_the_values_of_the_diagnostics_are_those_documented() -> None:
-    reported = Health(0.0).report(1.0, open_stream()).values
+    stream = open_stream()
+    reported = Health(0.0, stream).report(1.0, stream).values
     assert reported.keys() == first_column("docs/reference/node.md", "## Diagnostics")
 
 

@@ -12,7 +12,8 @@ from conftest import ROOT
 
 from paul_ros.lifted import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS
 from paul_ros.stream.ledger import Ledger
-from paul_ros.stream.reasons import DROP, NOTE, PERSON, REASONS
+from paul_ros.stream.reason import AT_ONCE, DROP, MOST, NEVER, NOTE, PERSON
+from paul_ros.stream.reasons import REASONS, reason_of
 
 #: Calls whose first argument is a reason.
 CALLS = {"MessageError", "Note", "drop", "note"}
@@ -90,3 +91,22 @@ def test_every_row_is_two_clear_sentences(slug):
     assert reason.slug == slug and slug == slug.lower() and " " not in slug
     assert not reason.what.endswith(".") and reason.fix.endswith(".")
     assert all(len(sentence.split()) <= 30 for sentence in (reason.what, *reason.fix.split(". ")))
+
+
+def test_only_what_is_normal_in_small_numbers_waits_for_a_share():
+    """Persons at the image's edge are normal; a message that cannot be read never is."""
+    limits = {slug: reason.limit for slug, reason in REASONS.items()}
+    for slug, reason in REASONS.items():
+        if reason.kind == DROP:
+            assert limits[slug] == (0.1 if slug == "missed" else AT_ONCE)
+        elif reason.kind == PERSON:
+            assert limits[slug] == MOST and reason.warns == "above 50 % of persons"
+    assert limits["unlike_the_model"] == limits["depth_disagrees"] == MOST
+    assert limits["another_frame"] == limits["depth_in_millimetres"] == AT_ONCE
+    assert limits["stamp_backwards"] == limits["clock_set_back"] == limits["depth_used"] == NEVER
+
+
+def test_reasons_of_other_packages_have_the_limits_of_their_kind():
+    assert reason_of("acme_is_empty", DROP).limit == AT_ONCE
+    assert reason_of("acme_is_odd", NOTE).limit == NEVER
+    assert (reason_of("person_acme", DROP).kind, reason_of("person_acme", DROP).limit) == (PERSON, MOST)

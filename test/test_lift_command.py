@@ -458,8 +458,7 @@ def test_a_bad_file_is_one_line(kind, content, clue, model_file, tmp_path, capsy
         (["--layout", "body25"], "17 keypoints, but layout 'body25' has 25; name the right one with --layout"),
         (["--layout", "coco71"], "did you mean 'coco17'?"),
         (["--output-layout", "body25"], "has no left_big_toe"),
-        (["--person-height", "9"], "person_height is 9.0"),
-        (["--min-confidence", "2"], "min_confidence is 2.0; it must be 0.0 to 1.0"),
+        (["--person-height", "9"], "--person-height is 9.0"),
         (["--model", "nobody"], "no model 'nobody'"),
     ],
 )
@@ -518,6 +517,7 @@ def test_the_input_is_never_overwritten(persons, model_file, tmp_path, capsys):
         (["in.npz"], "-o/--output"),
         (["in.npz", "-o", "o.npz", "--camera", "c.yaml", "--intrinsics", "1", "1", "1", "1"], "not allowed with"),
         (["in.npz", "-o", "o.npz", "--intrinsics", "1", "2"], "expected 4 arguments"),
+        (["in.npz", "-o", "o.npz", "--min-confidence", "2"], "'2' is not a confidence from 0 to 1"),
     ],
 )
 def test_wrong_usage(words, clue, capsys):

@@ -189,7 +189,7 @@ def test_diagnostics_have_counts_times_units_and_model(bench, model_file):
     assert (values["units"], values["model"], len(values["model_sha256"])) == ("model", "stand", 64)
     assert values["input_type"] == "sensor_msgs/msg/PointCloud2"
     status = bench.next_diagnostics()
-    assert status.level == b"\x01" and "no keypoints" in status.message
+    assert status.level == b"\x01" and "no metres without a usable CameraInfo" in status.message
 
 
 def test_parameters_may_change_where_the_table_says_so(bench):

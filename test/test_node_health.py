@@ -6,9 +6,10 @@ from __future__ import annotations
 import re
 import time
 
+import numpy as np
 import pytest
-from conftest import camera_info
-from node_bench import MAKE, Bench, class_of, good, set_parameters
+from conftest import camera_info, seen
+from node_bench import GOOD, MAKE, Bench, class_of, cloud, good, set_parameters
 
 
 @pytest.fixture
@@ -53,6 +54,25 @@ def test_levels_from_the_first_to_the_last_frame(started):
     assert re.search(r"No keypoints for \d+ s on /", bench.lifter.log())
 
 
+def test_a_person_at_the_edge_of_the_image_is_counted_and_no_warning(started):
+    """It walks in for half a second, stays for two, and walks out for half a second, twice."""
+    bench = started()
+    bench.matched()
+    bench.camera.publish(camera_info(MAKE))
+    bench.until(lambda: bench.units() == "m", "metres")
+    bench.until(lambda: bench.next_diagnostics().level == b"\x00", "level OK")
+    edge = seen(GOOD)
+    edge[:, 3:] = np.nan
+    begin = len(bench.got["diagnostics"])
+    for pixels in 2 * (5 * [edge] + 20 * [seen(GOOD)] + 5 * [edge]):
+        bench.send(cloud(pixels))
+        end = time.monotonic() + 0.1
+        bench.until(lambda end=end: time.monotonic() >= end, "a tenth of a second")
+    levels = {status.level for _, status in bench.got["diagnostics"][begin:]}
+    assert levels == {b"\x00"} and int(bench.diagnosed()["dropped_person_too_few_points"]) == 20
+    assert "person_too_few_points" not in bench.lifter.log()
+
+
 def test_latency_is_from_stamp_to_publish(started):
     bench = started()
     bench.matched()
@@ -77,10 +97,16 @@ def test_a_publisher_whose_qos_does_not_match_is_named(ros, started):
 
     bench = started("-r", "keypoints:=/loud", "-p", "qos_overrides./loud.subscription.reliability:=reliable")
     best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/loud", best_effort)
+    publisher = bench.node.create_publisher(class_of("sensor_msgs/msg/PointCloud2"), "/loud", best_effort)
     bench.until(lambda: "publisher of /loud" in bench.lifter.log(), "the warning")
     assert "RELIABILITY" in bench.lifter.log() and "qos_overrides./loud.subscription.reliability" in bench.lifter.log()
-    bench.until(lambda: any("QoS" in status.message for _, status in bench.got["diagnostics"]), "the diagnostics")
+    bench.until(lambda: "QoS" in bench.next_diagnostics().message, "the diagnostics")
+    for _ in range(3):
+        status = bench.next_diagnostics()
+        assert status.level == b"\x01" and "publisher of /loud" in status.message and "RELIABILITY" in status.message
+    bench.node.destroy_publisher(publisher)
+    bench.until(lambda: "QoS" not in bench.next_diagnostics().message, "the end of the mismatch")
+    assert bench.lifter.log().count("publisher of /loud") == 1
 
 
 def test_a_subscriber_whose_qos_does_not_match_is_named_and_the_override_helps(started):
@@ -130,6 +156,23 @@ def test_an_input_type_that_is_not_the_published_one_is_an_error(started):
     bench.until(lambda: warning in bench.lifter.log(), "the warning")
     bench.until(lambda: warning in bench.next_diagnostics().message, "the diagnostics")
     assert bench.next_diagnostics().level == b"\x02"
+
+
+def test_simulated_time_without_a_clock_is_named(started):
+    """Frames are lifted all the same, and the warning ends with the first publisher of /clock."""
+    bench = started("-p", "use_sim_time:=true")
+    bench.matched()
+    bench.lifts()
+    warning = "use_sim_time is true, but nobody publishes /clock"
+
+    def last():
+        return bench.got["diagnostics"][-1][1]  # all stamps are zero
+
+    bench.until(lambda: bench.got["diagnostics"] and warning in last().message, "the diagnostics")
+    assert last().level != b"\x00"
+    bench.node.create_publisher(class_of("rosgraph_msgs/msg/Clock"), "/clock", 10)
+    bench.until(lambda: warning not in last().message, "a clock")
+    assert bench.lifter.log().count(warning) == 1 and "--clock" in bench.lifter.log()
 
 
 def test_simulated_time_that_is_set_back(started):

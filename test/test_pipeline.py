@@ -34,8 +34,8 @@ def warnings(lifter_node, monkeypatch):
     from paul_ros.ros import advisor
 
     texts = []
-    for limit in ("SILENT_SECONDS", "WARNING_SECONDS", "NOTE_SECONDS"):
-        monkeypatch.setattr(advisor, limit, 0.0)
+    monkeypatch.setattr(advisor, "SILENT_SECONDS", 0.0)
+    monkeypatch.setattr(advisor, "REPEAT_SECONDS", (0.0,))
     monkeypatch.setattr(lifter_node._log, "_write", texts.append)
     return texts
 
@@ -63,10 +63,14 @@ def test_notes_are_logged_with_what_to_do(lifter_node, warnings):
     distorted.d = [0.1, 0.0, 0.0, 0.0, 0.0]
     for count in (1, 2):
         lifter_node.pipeline._on_camera_info(distorted)
-        lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
-        assert warnings.pop().startswith(f"noted: distorted_image, {count} so far. CameraInfo has distortion but no P")
-    lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
-    assert not warnings
+        warnings.clear()
+        lifter_node.pipeline._report()
+        noted = [text for text in warnings if text.startswith("noted")]
+        assert len(noted) == 1
+        assert noted[0].startswith(f"noted: distorted_image, {count} so far. CameraInfo has distortion but no P")
+    warnings.clear()
+    lifter_node.pipeline._report()
+    assert not [text for text in warnings if text.startswith("noted")]
 
 
 @pytest.fixture

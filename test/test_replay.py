@@ -271,7 +271,31 @@ def test_another_layout_of_as_many_points_is_reported(bag, tmp_path):
     assert not right["noted"] and "noted" not in table(right)
     assert wrong["noted"]["unlike_the_model"] > 0.9 * wrong["lifted"] > 50
     noted = next(line for line in table(wrong).splitlines() if "noted" in line)
-    assert "layout 'h36m17'" in noted and "set `layout` (paul: --layout)" in noted
+    assert "layout 'h36m17'" in noted and "set `layout` to" in noted
+
+
+def assert_dashes_are_explained(shown: str, *reasons: str) -> None:
+    """Every row with a "-" is named by a line below the table, and these lines are there."""
+    lines = shown.splitlines()
+    names = {line[:22].strip() for line in lines if " - " in f"{line[22:]} " and not line.startswith(" - ")}
+    explained = {name for line in lines if line.startswith(" - ") for name in line[3:].partition(":")[0].split("; ")}
+    assert names == explained and all(reason in shown for reason in reasons), shown
+
+
+def test_every_missing_figure_has_its_reason(tmp_path):
+    """Without CameraInfo there are no metres, and without ids there are no flips."""
+    with BagWriter(tmp_path / "x.mcap") as writer:
+        for record in read_records(ONE, ["/keypoints", "/ground_truth/poses"]):
+            writer.write_record(record)
+    report = evaluate(replay(tmp_path / "x.mcap", open_stream()))
+    why = "metres are needed; no usable CameraInfo has been received"
+    assert_dashes_are_explained(
+        table(report), f" - NE, flip per frame; NE, one flip for all; root error, median: {why}"
+    )
+    report = evaluate(replay(ONE, open_stream()))
+    assert_dashes_are_explained(table(report))
+    report |= {"flips_per_1000_frames": None, "root_error_median_mm": None, "root_error_median_percent": None}
+    assert_dashes_are_explained(table(report), "flips in depth: no person with an id", "root error, median: the ground")
 
 
 def test_no_person_at_all(model_file, tmp_path):
@@ -279,6 +303,9 @@ def test_no_person_at_all(model_file, tmp_path):
     report = evaluate(replay(bag, open_stream(model_file)))
     assert report["frames"] == 15 and report["persons"] == 0 and report["reprojection_median_px"] is None
     assert "15 frames, 0 persons" in table(report)
+    assert_dashes_are_explained(
+        table(report), "flips in depth: nobody was lifted", "lift, median: no message shows a person"
+    )
 
 
 def test_truth_in_another_layout():

@@ -314,13 +314,12 @@ def test_only_layouts_that_map_onto_the_model_are_proposed(model_file, make):
     stream = LiftStream(Lifter(replace(model, layout=walker)), half, 0.3, 64)
     assert_drops(stream, CLOUD, cloud(make, np.ones((1, 17, 2))))
     assert stream.ledger.advice["wrong_point_count"] == (
-        "17 keypoints are not a multiple of the layout's 8. Set `layout` (paul: --layout) to the one your detector "
+        "17 keypoints are not a multiple of the layout's 8. Set `layout` to the one your detector "
         "uses: walker (the model's own, by the path of its file)."
     )
     assert_drops(stream, CLOUD, cloud(make, np.ones((1, 25, 2))))
     assert stream.ledger.advice["wrong_point_count"].endswith(
-        "the layout's 8. No shipped layout that the model can use has that many: set `layout` (paul: --layout) to the "
-        "path of your own."
+        "the layout's 8. No shipped layout that the model can use has that many: set `layout` to the path of your own."
     )
 
 
@@ -541,9 +540,9 @@ def test_unknown_parameters_are_refused(model_file, name, advice):
 
 
 def test_parameters_out_of_their_limits_are_refused(model_file):
-    with pytest.raises(ParameterError, match="person_height is -1.0.*0 or 0.3 to 3.0"):
+    with pytest.raises(ParameterError, match="`person_height` is -1.0.*0 or 0.3 to 3.0"):
         open_stream(str(model_file), person_height=-1.0)
-    with pytest.raises(ParameterError, match="smoothing is '5'; it must be 0.0 to 100.0"):
+    with pytest.raises(ParameterError, match="`smoothing` is '5'; it must be 0.0 to 100.0"):
         open_stream(str(model_file), smoothing="5")
 
 

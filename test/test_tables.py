@@ -9,13 +9,13 @@ import sys
 import pytest
 
 from paul_ros.errors import MissingPackageError
-from paul_ros.offline.tables import cell, render
+from paul_ros.offline.tables import Missing, cell, figure, render
 
 COLUMNS = ("", "text"), ("lifted", ".1f"), ("99 %", ".2f"), ("", "unit")
 ROWS = [
     ("error [bold] of :smile:", 60.3, "9.20 / 11.00", "mm"),
     (),
-    ("誤差", 12345.6, None, "µs of one pose, alone or in a batch of many"),
+    ("誤差", 12345.6, Missing("99 %", "too few"), "µs of one pose, alone or in a batch of many"),
 ]
 
 
@@ -44,7 +44,20 @@ def test_a_pipe_gets_plain_text(variable, monkeypatch):
         " error [bold] of :smile:     60.3  9.20 / 11.00  mm",
         "",
         " 誤差                     12345.6             -  µs of one pose, alone or in a batch of many",
+        " - 99 %: too few",
     ]
+
+
+def test_every_reason_for_a_missing_figure_is_stated_once():
+    rows = [
+        ("a", figure(None, "x", "no ids")),
+        ("b", figure(0.0, "x", "no ids")),
+        ("c", Missing("x", "no ids"), Missing("y", "no ids")),
+        ("d", Missing("z", "no metres")),
+    ]
+    lines = render((("", "text"), ("x", ".1f"), ("y", ".1f")), rows).splitlines()
+    assert [line.split() for line in lines[1:5]] == [["a", "-"], ["b", "0.0"], ["c", "-", "-"], ["d", "-"]]
+    assert lines[5:] == [" - x; y: no ids", " - z: no metres"]
 
 
 def test_nothing_is_folded_in_a_pipe():

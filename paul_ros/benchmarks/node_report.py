@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.offline.tables import render
+from paul_ros.offline.tables import figure, render
 
 _COLOURS = {"lifter": "#1f77d0", "echo": "#8a8a8a"}
 _MIN_US = 100  # where the axes of the picture begin
@@ -37,7 +37,8 @@ def table(report: dict) -> str:
     for row in report["rows"]:
         ratio = ratios.get((row["persons"], row["rate_hz"])) if row["node"] == "lifter" else None
         shown = {**row, **(ratio or {})}
-        rows.append([shown[key] for *_, key in _COLUMNS if key in shown])
+        name = f"{row['persons']} persons at {row['rate_hz']:g} Hz"
+        rows.append([figure(shown[key], name, "a node answered no message") for *_, key in _COLUMNS if key in shown])
     starts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["start_to_first_output_s"].items())
     machine = report["machine"]
     lines = [

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.offline.tables import Row, render
+from paul_ros.offline.tables import Row, figure, render
 
 _COLOURS = {"ours": "#111111", "lsq_svd": "#e4572e", "polar": "#f0a030", "majorise": "#1f77d0", "lm_search": "#2a9d50"}
 _MIN_ANGLE = 1e-3  # degrees; smaller angles are drawn here
@@ -30,6 +30,14 @@ _COLUMNS = (
     ("x lsq", ".2f", "batch_over_lsq"),
 )
 """Heading, kind and key."""
+
+_WHY_MISSING = {
+    "certified_percent": ("cert. %", "only the method ours has a certificate"),
+    "certified_wrong": ("wrong", "only the method ours has a certificate"),
+    "better_than_ours": ("better", "it compares the other methods with ours"),
+    "us_batch": ("µs batch", "lm_search is too slow for a batch"),
+    "batch_over_lsq": ("µs batch", "lm_search is too slow for a batch"),
+}
 
 
 def table(report: dict) -> str:
@@ -61,7 +69,7 @@ def _cells(row: dict, lsq: dict) -> Row:
         "single_over_lsq": single and single / lsq["us_single"],
         "batch_over_lsq": batch and batch / lsq["us_batch"],
     }
-    return [shown[key] for *_, key in _COLUMNS]
+    return [figure(shown[key], *_WHY_MISSING.get(key, (key, ""))) for *_, key in _COLUMNS]
 
 
 def _shape_table(scenarios: dict[str, dict[str, dict]]) -> str:

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Collection
 
 from paul_ros import __version__
+from paul_ros.cli.advice import in_options
 from paul_ros.cli.options import HelpFormatter
 from paul_ros.cli.parser import Parser
 from paul_ros.signals import stoppable
@@ -90,6 +91,7 @@ def _run_and_flush(argv: list[str]) -> int:
 def _run(argv: list[str]) -> int:
     if argv[:1] != [_OWN_THREADS]:
         _use_one_thread()
+    args = argparse.Namespace()
     try:
         parser = build_parser(argv)
         args = parser.parse_args(argv)
@@ -100,7 +102,7 @@ def _run(argv: list[str]) -> int:
     except Exception as error:
         if not _is_expected(error) or _is_of_stdout(error):
             raise
-        _say(" ".join(_text(error).split()))
+        _say(" ".join(in_options(_text(error), vars(args)).split()))
         return 1
     return 0
 

@@ -11,10 +11,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_layout, add_person_height
+from paul_ros.cli.options import (
+    Commands,
+    HelpFormatter,
+    add_min_confidence,
+    add_model,
+    add_output_layout,
+    add_person_height,
+)
 from paul_ros.cli.output import STDOUT, check_files, open_output, output_path
 from paul_ros.cli.progress import progress
-from paul_ros.stream.parameters import DEFAULTS
 from paul_ros.wording import quantity
 
 if TYPE_CHECKING:
@@ -103,13 +109,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_model(parser)
     add_person_height(parser)
-    parser.add_argument(
-        "--min-confidence",
-        metavar="C",
-        type=float,
-        default=DEFAULTS["min_confidence"],
-        help="keypoints with a lower confidence count as hidden, as in the node (default: %(default)s)",
-    )
+    add_min_confidence(parser)
     parser.set_defaults(run=run, usage_error=parser.error)
 
 

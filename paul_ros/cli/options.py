@@ -61,6 +61,33 @@ def add_person_height(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_filters(parser: argparse.ArgumentParser) -> None:
+    """Add --min-confidence and --max-persons, as the node's parameters."""
+    from paul_ros.stream.parameters import DEFAULTS
+
+    add_min_confidence(parser)
+    parser.add_argument(
+        "--max-persons",
+        metavar="N",
+        type=positive,
+        default=DEFAULTS["max_persons"],
+        help="messages with more persons are dropped, as in the node (default: %(default)s)",
+    )
+
+
+def add_min_confidence(parser: argparse.ArgumentParser) -> None:
+    """Add --min-confidence."""
+    from paul_ros.stream.parameters import DEFAULTS
+
+    parser.add_argument(
+        "--min-confidence",
+        metavar="C",
+        type=confidence,
+        default=DEFAULTS["min_confidence"],
+        help="keypoints with a lower confidence count as hidden, as in the node (default: %(default)s)",
+    )
+
+
 def add_output_layout(parser: argparse.ArgumentParser) -> None:
     """Add --output-layout."""
     parser.add_argument(

@@ -6,10 +6,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from paul_ros.cli.advice import in_options
 from paul_ros.cli.options import (
     PICTURES,
     Commands,
     HelpFormatter,
+    add_filters,
     add_json,
     add_model,
     add_output_layout,
@@ -65,6 +67,7 @@ def add_parser(commands: Commands) -> None:
         metavar="HZ",
         help="cut-off frequency of the smoothing over time, as the node's parameter `smoothing` (default: off)",
     )
+    add_filters(parser)
     add_topics(parser)
     parser.add_argument(
         "--depth-topic",
@@ -101,11 +104,13 @@ def run(args: argparse.Namespace) -> None:
     if args.json != STDOUT:
         require("bags", "rich")
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
-    parameters = {name: getattr(args, name) for name in ("output_layout", "person_height", "smoothing")}
+    names = ("output_layout", "person_height", "smoothing", "min_confidence", "max_persons")
+    parameters = {name: getattr(args, name) for name in names}
     stream = open_stream(args.model, args.layout, **parameters)
     with progress("replay") as count:
         done = replay(args.bag, stream, args.output, topics, lambda: count(1))
     report = evaluate(done)
+    report["advice"] = {reason: in_options(text, vars(args)) for reason, text in report["advice"].items()}
     publish(report, table, args.json, (lambda: write_picture(args.plot, done)) if args.plot else None)
     written = [str(path) for path in (args.output, args.json, args.plot) if path]
     if written and args.json != STDOUT:

@@ -8,10 +8,9 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_json, confidence
+from paul_ros.cli.options import Commands, HelpFormatter, add_json, add_min_confidence
 from paul_ros.cli.output import STDOUT, publish
 from paul_ros.extras import require
-from paul_ros.stream.parameters import DEFAULTS
 
 _EXAMPLES = """\
 examples:
@@ -102,13 +101,7 @@ def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: coco17 for 17 points and for bags, else points without names)",
     )
     parser.add_argument("--topic", help="topic of the 2D keypoints, if a bag has several; * matches any part of a name")
-    parser.add_argument(
-        "--min-confidence",
-        type=confidence,
-        default=DEFAULTS["min_confidence"],
-        metavar="C",
-        help="keypoints of a bag with a lower confidence count as hidden, as in the node (default: %(default)s)",
-    )
+    add_min_confidence(parser)
 
 
 def _add_output_arguments(parser: argparse.ArgumentParser) -> None:

@@ -94,6 +94,13 @@ def _model(thing: str) -> dict:
     }
 
 
+_UNKNOWN = {
+    "rate_hz": "unknown: it needs messages of two times",
+    "metres_per_unit": "unknown: points are in model units",
+}
+"""Key -> text for people in place of null."""
+
+
 def as_text(summary: dict) -> str:
     """Return a summary as `key  value` lines, nested parts indented; the terminal wraps long lists.
 
@@ -113,13 +120,13 @@ def _lines(value: dict, indent: str) -> list[str]:
             for number, part in enumerate(item, 1):
                 lines += [f"{indent}  {number}", *_lines(part, indent + "    ")]
         else:
-            lines.append(f"{indent}{key:<{width}}{_brief(item)}")
+            lines.append(f"{indent}{key:<{width}}{_UNKNOWN[key] if item is None and key in _UNKNOWN else _brief(item)}")
     return lines
 
 
 def _brief(item: object) -> str:
     if item is None or item in ({}, [], ()):
-        return "-"
+        return "none"
     if isinstance(item, float):
         return f"{item:.6g}"
     if isinstance(item, (list, tuple)):

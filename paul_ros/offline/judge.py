@@ -44,6 +44,7 @@ def evaluate(done: Replay) -> dict:
         The report, ready for JSON. A value is None where it cannot be had.
 
         - bag, model, model_sha256, layout, input_layout, units ('m' or 'model'), damage, versions: what was judged.
+        - scale_source: where the scale comes from, or after "none: " why there is none.
         - frames, persons, lifted: counts of messages, of persons in them, and of lifted persons.
         - dropped, noted: reason -> count of discarded, and of odd but used, messages and persons.
         - advice: reason -> what to do about it.
@@ -79,6 +80,7 @@ def evaluate(done: Replay) -> dict:
         "noted": dict(sorted(stream.ledger.notes.items())),
         "advice": dict(sorted(stream.ledger.advice.items())),
         "units": stream.units,
+        "scale_source": stream.describe()["scale_source"],
         **error_measures(pairs_with_truth(done, done.frames), done.layout.root),
         "reprojection_median_px": _median([lift.reprojection[good] for lift, good in zip(lifts, ok)]),
         "certified_share": _mean([lift.certified[good] for lift, good in zip(lifts, ok)]),

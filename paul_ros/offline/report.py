@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from paul_ros.offline.tables import Row, cell, render
+from paul_ros.offline.tables import Cell, Row, cell, figure, render
 
 _ERROR_ROWS = (
     ("N-MPJPE", "n_mpjpe_mm", "mm"),
@@ -42,20 +42,43 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
     if report["persons_with_truth"]:
         lines.append(f"  {_who_is_judged(report)}")
         lifted, rigid = "lifted", "rigid"
-        rows = [(name, report[key], report["baseline"][key], unit) for name, key, unit in _ERROR_ROWS]
+        rows = [(name, *_errors(report, name, key), unit) for name, key, unit in _ERROR_ROWS]
         rows.append(())
+    else:
+        lines.append("  no errors: no lifted person has a ground truth")
     columns = (("", "text"), (lifted, ".1f"), (rigid, ".1f"), ("", "unit"))
     return "\n".join([*lines, render(columns, [*rows, *_figures(report), *further])])
 
 
+def _errors(report: dict, name: str, key: str) -> tuple[Cell, Cell]:
+    """Return an error of the lifted persons and of the rigid mean shape."""
+    if report["units"] == "m":
+        why = "the ground truth has no root, or persons were lifted before the first CameraInfo"
+    else:
+        why = f"metres are needed; {report['scale_source'].removeprefix('none: ')}"
+    return figure(report[key], name, why), figure(report["baseline"][key], name, why)
+
+
 def _figures(report: dict) -> list[Row]:
     """Return the rows that need no truth: name, figure, "", unit."""
+    nobody = "nobody was lifted"
+    flips = "no person with an id was lifted in two successive frames; use tracked keypoints"
+    times = (report[key] for key in ("lift_us_median", "lift_us_p99"))
+    lift, lift_p99 = (figure(time, "lift, median", "no message shows a person") for time in times)
+    rows = (
+        ("reprojection, median", report["reprojection_median_px"], nobody, "px"),
+        ("proven optimal", _percent(report["certified_share"]), nobody, "%"),
+        ("mirror ambiguous", _percent(report["ambiguous_share"]), nobody, "%"),
+        (
+            "flips in depth",
+            report["flips_per_1000_frames"],
+            flips if report["lifted"] else nobody,
+            "per 1000 pairs of frames",
+        ),
+    )
     return [
-        ("reprojection, median", report["reprojection_median_px"], "", "px"),
-        ("proven optimal", _percent(report["certified_share"]), "", "%"),
-        ("mirror ambiguous", _percent(report["ambiguous_share"]), "", "%"),
-        ("flips in depth", report["flips_per_1000_frames"], "", "per 1000 pairs of frames"),
-        ("lift, median", report["lift_us_median"], "", f"µs per frame (99 %: {cell(report['lift_us_p99'])})"),
+        *((name, figure(value, name, why), "", unit) for name, value, why, unit in rows),
+        ("lift, median", lift, "", f"µs per frame (99 %: {cell(lift_p99)})"),
     ]
 
 

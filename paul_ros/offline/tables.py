@@ -5,11 +5,27 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 
 from paul_ros.extras import require
 
-Row = Sequence[str | float | None]
+
+@dataclass(frozen=True)
+class Missing:
+    """A cell without a figure: "-" in the table, and the reason below it.
+
+    Attributes:
+        name: of the figure.
+        why: why it is missing, without a full stop.
+    """
+
+    name: str
+    why: str
+
+
+Cell = str | float | Missing | None
+Row = Sequence[Cell]
 """Cells from the left: texts are shown as they are, numbers in the format of their column, None as "-"."""
 
 _UNLIMITED = 10_000  # width of a file or a pipe, so that no line is folded
@@ -19,7 +35,7 @@ def render(columns: Sequence[tuple[str, str]], rows: Iterable[Row]) -> str:
     """Return aligned lines of text.
 
     A terminal gets a bold heading, dim units, and lines of its own width. Only texts and units are folded, between
-    words. A file or a pipe gets plain text, a line for each row.
+    words. A file or a pipe gets plain text, a line for each row. Every reason for a missing figure follows in a line.
 
     Args:
         columns: heading and kind: "text" (aligned left), "unit" (aligned left, dim), or the format of numbers
@@ -36,6 +52,7 @@ def render(columns: Sequence[tuple[str, str]], rows: Iterable[Row]) -> str:
     from rich.measure import Measurement
     from rich.table import Table
 
+    rows = list(rows)
     headings, kinds = zip(*columns)
     texts = [[cell(value, kind) for value, kind in zip(row, kinds)] for row in rows]
     watched = sys.stdout is not None and sys.stdout.isatty()
@@ -60,11 +77,20 @@ def render(columns: Sequence[tuple[str, str]], rows: Iterable[Row]) -> str:
     console.width = max(console.width, least)
     with console.capture() as captured:
         console.print(table, crop=False)
-    return "\n".join(line.rstrip() for line in captured.get().splitlines())
+    missing: dict[str, dict[str, None]] = {}  # reason -> names, each once
+    for value in (value for row in rows for value in row if isinstance(value, Missing)):
+        missing.setdefault(value.why, {})[value.name] = None
+    reasons = [f" - {'; '.join(names)}: {why}" for why, names in missing.items()]
+    return "\n".join([*(line.rstrip() for line in captured.get().splitlines()), *reasons])
 
 
-def cell(value: str | float | None, kind: str = ".1f") -> str:
+def figure(value: str | float | None, name: str, why: str) -> Cell:
+    """Return a figure of a report as a cell, which says why it is missing if it is None."""
+    return Missing(name, why) if value is None else value
+
+
+def cell(value: Cell, kind: str = ".1f") -> str:
     """Return the text of a cell in a column of this kind."""
-    if value is None:
+    if value is None or isinstance(value, Missing):
         return "-"
     return value if isinstance(value, str) else format(value, kind)

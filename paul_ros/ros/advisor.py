@@ -5,70 +5,71 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from paul_ros.stream.ledger import Ledger
+from paul_ros.stream.reason import NOTE, Reason
 
 SILENT_SECONDS = 5.0
-"""Time without keypoints before a warning."""
+"""Time without keypoints, or without /clock, before a warning."""
 
-WARNING_SECONDS = 5.0
-"""Shortest time between two warnings of one kind."""
-
-NOTE_SECONDS = 60.0
-"""Shortest time between two warnings of one kind that are not fatal, such as a missing CameraInfo."""
+REPEAT_SECONDS = (60.0, 600.0)
+"""Shortest time from the first warning of one kind to the second, and between later ones."""
 
 
 class ThrottledLog:
-    """Writes a line at once, and another with the same key only after an interval."""
+    """Writes a line at once, another with the same key after a minute, and then one in ten minutes at most."""
 
     def __init__(self, write: Callable[[str], None]) -> None:
         """Make a log that passes its lines to `write`."""
         self._write = write
-        self._written: dict[str, float] = {}
+        self._due: dict[str, float] = {}
+        self._written: Counter[str] = Counter()
 
-    def __call__(self, key: str, text: str, interval: float | None = None) -> None:
-        """Write a line, unless the last one with this key is younger than the interval in seconds."""
+    def __call__(self, key: str, text: str) -> None:
+        """Write a line, unless the last one with this key is too recent."""
         now = time.monotonic()
-        if now - self._written.get(key, -float("inf")) >= (WARNING_SECONDS if interval is None else interval):
-            self._written[key] = now
+        if now >= self._due.get(key, now):
+            self._due[key] = now + REPEAT_SECONDS[min(self._written[key], len(REPEAT_SECONDS) - 1)]
+            self._written[key] += 1
             self._write(text)
 
-    def hold(self, key: str) -> None:
-        """Suppress lines with this key for one interval from now."""
-        self._written[key] = time.monotonic()
+    def hold(self, key: str, seconds: float) -> None:
+        """Suppress lines with this key for some seconds from now."""
+        self._due[key] = time.monotonic() + seconds
+
+    def forget(self) -> None:
+        """Write the next line of every kind at once, as after a change by the user."""
+        self._due.clear()
+        self._written.clear()
 
 
 class Advisor:
-    """Warns of what the stream drops and notes, of silence and of missing metres."""
+    """Warns of what the stream drops and notes, of silence, of missing metres and of a missing clock."""
 
     def __init__(self, log: ThrottledLog) -> None:
         self._log = log
-        self._drops: Counter[str] = Counter()
-        self._notes: Counter[str] = Counter()
+        self._logged: dict[str, int] = {}
 
-    def report_drops(self, ledger: Ledger) -> None:
-        """Warn of every reason whose drops have grown since the last call."""
-        for reason, count in ledger.drops.items():
-            if count != self._drops[reason]:
-                self._drops[reason] = count
-                self._log(reason, f"dropped: {reason}, {count} so far. {ledger.advice.get(reason, '')}")
-
-    def report_notes(self, ledger: Ledger) -> None:
-        """Warn of every note that has grown since the last call, if there is advice on it."""
-        for reason in ledger.notes.keys() & ledger.advice.keys():
-            count = ledger.notes[reason]
-            if count != self._notes[reason]:
-                self._notes[reason] = count
-                self._log(reason, f"noted: {reason}, {count} so far. {ledger.advice[reason]}", NOTE_SECONDS)
+    def report_reasons(self, reasons: Iterable[Reason], ledger: Ledger) -> None:
+        """Warn of every reason that is worth it, and whose count has grown since the last call."""
+        for reason in reasons:
+            counts, verb = (ledger.notes, "noted") if reason.kind == NOTE else (ledger.drops, "dropped")
+            count = counts[reason.slug]
+            if count != self._logged.get(reason.slug):
+                self._logged[reason.slug] = count
+                advice = ledger.advice.get(reason.slug, "")
+                self._log(reason.slug, f"{verb}: {reason.slug}, {count} so far. {advice}")
 
     def report_silence(self, seconds: float, topic: str, has_publisher: Callable[[], bool]) -> None:
         """Warn if no keypoints have come on a topic for a while; `has_publisher` is called only then."""
-        if seconds >= SILENT_SECONDS:
-            advice = (
-                "Check the detector." if has_publisher() else "Nobody publishes it: remap `keypoints` to your detector."
-            )
-            self._log("silent", f"No keypoints for {seconds:.0f} s on {topic}. {advice}")
+        if seconds < SILENT_SECONDS:
+            return
+        silence = f"No keypoints for {seconds:.0f} s on {topic}."
+        if has_publisher():
+            self._log("silent", f"{silence} Check the detector.")
+        else:
+            self._log("no publisher", f"{silence} Nobody publishes it: remap `keypoints` to your detector.")
 
     def report_model_units(self, reason: str) -> None:
         """Warn that points are in model units; the reason is the stream's description of its scale."""
@@ -76,7 +77,12 @@ class Advisor:
             f"Points are in model units, not metres: {reason.removeprefix('none: ')}. "
             "Remap `camera_info` to a calibrated camera."
         )
-        self._log("units", text, NOTE_SECONDS)
+        self._log("units", text)
+
+    def report_trouble(self, trouble: Iterable[str]) -> None:
+        """Warn of other trouble; each sentence is a kind of its own."""
+        for text in trouble:
+            self._log(text, text)
 
     def report_clock_set_back(self, seconds: float) -> None:
         """Warn that simulated time was set back."""

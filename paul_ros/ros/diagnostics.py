@@ -3,24 +3,28 @@
 
 The levels, from the first that applies:
 
-- ERROR: the input cannot be read; or, since the last report, the node itself failed or could use no message.
+- ERROR: the input cannot be read; or the node itself failed in the last WINDOW reports; or no message of the last
+  second could be used.
 - STALE: keypoints came once, but none for STALE_SECONDS.
-- WARN: any of these was found since the last report. No keypoints came. Something was dropped. A QoS does not match.
-  The keypoints' frame is not the camera's. Most persons hardly fit the model. A CameraInfo is missing for metres.
+- WARN: any of these. No keypoints came yet, or none for QUIET_SECONDS. A reason of the last WINDOW reports exceeds its
+  share (`RecentCounts`). A CameraInfo is missing for metres. There is other trouble, such as a QoS that does not match.
 - OK: none of these.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from paul_ros.lifted import AMBIGUOUS
+from paul_ros.ros.recent_counts import WINDOW, RecentCounts
 from paul_ros.stream.frame import Frame
+from paul_ros.stream.reason import DROP, NEVER, NOTE, PERSON, Reason
+from paul_ros.stream.reasons import reason_of
 from paul_ros.stream.stream import LiftStream
 
 #: Levels, by the numbers of diagnostic_msgs/DiagnosticStatus.
@@ -29,11 +33,11 @@ OK, WARN, ERROR, STALE = range(4)
 STALE_SECONDS = 5.0
 """Silence from which the level is STALE; diagnostic_aggregator allows a silent node as long."""
 
+QUIET_SECONDS = 2.5
+"""Silence from which the level is WARN; slower detectors than 0.4 Hz are not expected."""
+
 MAX_LATENCY_SECONDS = 10.0
 """Latency above which a stamp is ignored. Such a stamp, or one in the future, belongs to another clock, as in a bag."""
-
-MOST_PERSONS = 0.5
-"""Share of the lifted persons that must hardly fit the model before it is worth a warning."""
 
 _LATENCIES_KEPT = 1000  # frames, the last half minute at 30 Hz
 _NS = 1e9
@@ -47,28 +51,30 @@ class Report:
         level: OK, WARN, ERROR or STALE.
         message: one line for people.
         values: name -> value, for /diagnostics.
-        frames: number of frames since the last report.
+        lifting: whether recent reports had frames.
         silent_seconds: seconds since the last keypoints; before the first, since the node began to wait.
+        warnings: reasons that are worth a line in the log.
     """
 
     level: int
     message: str
     values: dict[str, Any]
-    frames: int
+    lifting: bool
     silent_seconds: float
+    warnings: list[Reason]
 
 
 class Health:
     """Counts messages and frames, and reports on the time since the last report. Times are monotonic seconds."""
 
-    def __init__(self, now: float, drops: Mapping[str, int] = {}, notes: Mapping[str, int] = {}) -> None:
-        """Begin to wait for keypoints; drops and notes were counted before and are not reported."""
+    def __init__(self, now: float, stream: LiftStream) -> None:
+        """Begin to wait for keypoints; what the stream has counted until now is old news."""
         self._began = self._last_report = now
         self._last_input: float | None = None
-        self._messages = self._frames = self._mismatches = 0
+        self._messages = self._frames = 0
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._lifted: list[tuple[np.ndarray, np.ndarray]] = []
-        self._old_drops, self._old_notes = Counter(drops), Counter(notes)
+        self._recent = RecentCounts(stream)
 
     def received(self, now: float) -> None:
         """Count a message of keypoints."""
@@ -84,15 +90,18 @@ class Health:
         if 0 <= latency <= MAX_LATENCY_SECONDS:
             self._latencies.append(latency)
 
-    def qos_mismatch(self) -> None:
-        """Count an endpoint whose QoS does not match."""
-        self._mismatches += 1
-
     def forget_latency(self) -> None:
         """Discard all latencies, after the clock was set."""
         self._latencies.clear()
 
-    def report(self, now: float, stream: LiftStream, problem: str = "", input_type: str = "none") -> Report:
+    def report(
+        self,
+        now: float,
+        stream: LiftStream,
+        problem: str = "",
+        input_type: str = "none",
+        trouble: Sequence[str] = (),
+    ) -> Report:
         """Report on the time since the last report.
 
         Args:
@@ -100,29 +109,30 @@ class Health:
             stream: the stream in use.
             problem: why the input cannot be read; '' if it can, or if there is none yet.
             input_type: message type of the input.
+            trouble: sentences about what else is worth a warning.
         """
+        self._recent.add(stream, self._messages)
         silence = None if self._last_input is None else now - self._last_input
-        drops = Counter(stream.ledger.drops) - self._old_drops
-        level, message = self._level(drops, silence, problem, stream)
-        frames, values = self._frames, self._values(now, silence, stream, input_type)
-        self._last_report, self._messages, self._frames, self._mismatches = now, 0, 0, 0
-        self._old_drops, self._old_notes = Counter(stream.ledger.drops), Counter(stream.ledger.notes)
-        self._lifted = []
-        return Report(level, message, values, frames, now - self._began if silence is None else silence)
+        level, message = self._level(silence, problem, stream, trouble)
+        values = self._values(now, silence, stream, input_type)
+        self._last_report, self._messages, self._frames, self._lifted = now, 0, 0, []
+        silent_seconds = now - self._began if silence is None else silence
+        return Report(level, message, values, bool(self._recent.frames), silent_seconds, self._worth_logging(stream))
 
-    def _level(self, drops: Counter, silence: float | None, problem: str, stream: LiftStream) -> tuple[int, str]:
+    def _level(
+        self, silence: float | None, problem: str, stream: LiftStream, trouble: Sequence[str]
+    ) -> tuple[int, str]:
         if problem:
             return ERROR, problem
-        notes = Counter(stream.ledger.notes) - self._old_notes
-        if notes["callback_failed"]:
+        if self._recent.count("callback_failed"):
             return ERROR, "a callback of this node failed, see its log"
-        if drops["internal_error"]:
-            return ERROR, f"a fault of this node, see its log; dropped: {listed(drops)}"
-        if self._messages and not self._frames and _dropped_messages(drops) >= self._messages:
-            return ERROR, f"no message could be used; dropped: {listed(drops)}"
+        if self._recent.count("internal_error"):
+            return ERROR, f"a fault of this node, see its log; {self._dropped()}"
+        if self._messages and not self._frames and _dropped_messages(self._recent.newest, stream) >= self._messages:
+            return ERROR, f"no message could be used; {self._dropped()}"
         if silence is not None and silence >= STALE_SECONDS:
-            return STALE, f"no keypoints for {silence:.0f} s; check the detector"
-        warnings = list(self._warnings(drops, silence, stream))
+            return STALE, "; ".join([f"no keypoints for {silence:.0f} s; check the detector", *trouble])
+        warnings = [*self._warnings(silence, stream), *trouble]
         summary = f"{self._frames} frames since the last report, units: {stream.units}"
         return (
             (WARN, "; ".join([*(warning.removesuffix(".") for warning in warnings), summary]))
@@ -130,22 +140,29 @@ class Health:
             else (OK, summary)
         )
 
-    def _warnings(self, drops: Counter, silence: float | None, stream: LiftStream) -> Iterator[str]:
+    def _warnings(self, silence: float | None, stream: LiftStream) -> Iterator[str]:
         if silence is None:
             yield "no keypoints yet"
-        elif not self._messages:
-            yield "no keypoints since the last report"
-        if drops:
-            yield f"dropped: {listed(drops)}"
-        if self._mismatches:
-            yield f"{self._mismatches} endpoints with a QoS that does not match, see the log"
-        notes = Counter(stream.ledger.notes) - self._old_notes
-        if notes["another_frame"]:
-            yield stream.ledger.advice["another_frame"]
-        if notes["unlike_the_model"] > MOST_PERSONS * self._persons_lifted():
-            yield stream.ledger.advice["unlike_the_model"]
-        if lacks_camera_info(stream) and self._frames:
+        elif silence >= QUIET_SECONDS:
+            yield f"no keypoints for {silence:.0f} s"
+        warnings = self._recent.warnings
+        if any(reason.kind != NOTE for reason in warnings):
+            yield self._dropped()
+        for reason in warnings:
+            if reason.kind == NOTE:
+                yield stream.ledger.advice.get(reason.slug, reason.advice)
+        if lacks_camera_info(stream) and self._recent.frames:
             yield "no metres without a usable CameraInfo, remap `camera_info`"
+
+    def _dropped(self) -> str:
+        """Return the recent drops that are worth a warning, in words."""
+        drops = [self._recent.described(reason) for reason in self._recent.warnings if reason.kind != NOTE]
+        return f"dropped: {', '.join(drops)} in the last {WINDOW} s"
+
+    def _worth_logging(self, stream: LiftStream) -> list[Reason]:
+        """Return the reasons that are worth a warning, and notes that never are but have advice."""
+        never = [r for r in self._recent.recent if r.limit == NEVER and r.slug in stream.ledger.advice]
+        return [*self._recent.warnings, *never]
 
     def _values(self, now: float, silence: float | None, stream: LiftStream, input_type: str) -> dict[str, Any]:
         elapsed = max(now - self._last_report, 1e-9)
@@ -214,6 +231,7 @@ def summary(stream: LiftStream) -> str:
     )
 
 
-def _dropped_messages(drops: Counter) -> int:
+def _dropped_messages(reasons: Counter[str], stream: LiftStream) -> int:
     """Return how many drops are messages that came: neither persons nor messages that were lost on the way."""
-    return sum(count for reason, count in drops.items() if not reason.startswith("person_") and reason != "missed")
+    drops = (slug for slug in reasons if slug in stream.ledger.drops and slug != "missed")
+    return sum(reasons[slug] for slug in drops if reason_of(slug, DROP).kind != PERSON)

@@ -16,7 +16,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from paul_ros.ros.advisor import NOTE_SECONDS, ThrottledLog
+from paul_ros.ros.advisor import ThrottledLog
 from paul_ros.ros.diagnostics import summary
 from paul_ros.ros.node_parameters import REFUSALS, acceptable, declare, one_line, unknown_at_start
 from paul_ros.ros.pipeline import Pipeline
@@ -107,7 +107,7 @@ class LifterNode(LifecycleNode):
         """
         trace = "".join(traceback.format_exception(error))
         text = f"Fault in {where}; the node goes on. Report it with this text.\n{trace}"
-        self._fault_log(f"{where} {type(error).__name__}", text, NOTE_SECONDS)
+        self._fault_log(f"{where} {type(error).__name__}", text)
         if self._pipeline:
             self.stream.ledger.note("callback_failed")
 

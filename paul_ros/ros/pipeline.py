@@ -15,11 +15,12 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import CameraInfo, Image
 
 import msg_adapters
-from paul_ros.ros.advisor import Advisor, ThrottledLog
+from paul_ros.ros.advisor import SILENT_SECONDS, Advisor, ThrottledLog
 from paul_ros.ros.diagnostics import Health, lacks_camera_info
 from paul_ros.ros.keypoint_input import KeypointInput
 from paul_ros.ros.output_topics import OutputTopics
 from paul_ros.ros.qos import OVERRIDES, input_qos, subscription_events
+from paul_ros.ros.trouble import Trouble
 from paul_ros.stream.frame import Frame
 from paul_ros.stream.reasons import REASONS
 from paul_ros.stream.stream import LiftStream, open_stream
@@ -57,7 +58,7 @@ class Pipeline:
         self._node, self._log = node, log
         self.stream = open_stream(**parameters)
         self._announced_route = self.stream.route
-        self._health, self._advisor = Health(time.monotonic()), Advisor(log)
+        self._health, self._advisor, self._trouble = Health(time.monotonic(), self.stream), Advisor(log), Trouble(node)
         self._input = KeypointInput(node, "keypoints", parameters["input_type"], self, log)
         self._topics = OutputTopics(node, parameters, self.on_qos_mismatch)
         self._subscriptions: list[Subscription] = []
@@ -72,9 +73,10 @@ class Pipeline:
 
     def activate(self) -> None:
         """Subscribe and publish from now on; raises what rclpy raises for QoS overrides that it cannot use."""
-        self._health = Health(time.monotonic(), self.stream.ledger.drops, self.stream.ledger.notes)
+        self._health, self._trouble = Health(time.monotonic(), self.stream), Trouble(self._node)
+        self._log.forget()
         # Discovery takes its time: an absent publisher is worth a warning only after a while.
-        self._log.hold("no input")
+        self._log.hold("no input", SILENT_SECONDS)
         self._subscribe(CameraInfo, "camera_info", self._on_camera_info)
         self._subscribe(Image, "depth", self._on_depth)
         self._group_ticks = 0
@@ -105,6 +107,7 @@ class Pipeline:
         if self.active:
             self.flush()
         self.stream, self._announced_route = stream, stream.route
+        self._log.forget()
         model = stream.lifter.model
         self._node.get_logger().info(f"Lifting with model {model.name} ({model.sha256[:12]}).")
 
@@ -132,9 +135,9 @@ class Pipeline:
         self._health.received(time.monotonic())
 
     def on_qos_mismatch(self, topic: str, warning: str) -> None:
-        """Count and log an endpoint whose QoS does not match; see KeypointListener."""
-        self._health.qos_mismatch()
-        self._log(f"qos {topic}", warning)
+        """Warn of an endpoint whose QoS does not match, at once and as long as it does; see KeypointListener."""
+        self._trouble.add_qos_mismatch(topic, warning)
+        self._advisor.report_trouble([warning])
 
     def max_bodies(self) -> int:
         """Return the largest number of bodies to follow; see KeypointListener."""
@@ -142,12 +145,10 @@ class Pipeline:
 
     def _on_camera_info(self, msg: CameraInfo) -> None:
         self.stream.camera_info(msg)
-        self._advisor.report_drops(self.stream.ledger)
         self.publish_layout()
 
     def _on_depth(self, msg: Image) -> None:
         self.stream.depth(msg)
-        self._advisor.report_drops(self.stream.ledger)
 
     def _on_group_tick(self) -> None:
         """Flush at the second tick: at the first, if this process was kept from running, a message may be waiting."""
@@ -189,7 +190,6 @@ class Pipeline:
             with self.stream.guard():
                 self._topics.publish_frame(frame)
                 self._health.published(frame, self._now_ns())
-        self._advisor.report_drops(self.stream.ledger)
 
     def _now_ns(self) -> int:
         """Return the present by the clock of the stamps; for system time rclpy's own call takes ten times as long."""
@@ -210,11 +210,13 @@ class Pipeline:
         if not self._input.check_type():
             self._search_timer.reset()
         input_type = self._input.type_name or "none"
-        report = self._health.report(time.monotonic(), self.stream, self._input.problem, input_type)
-        self._advisor.report_notes(self.stream.ledger)
+        trouble = self._trouble.sentences()
+        report = self._health.report(time.monotonic(), self.stream, self._input.problem, input_type, trouble)
+        self._advisor.report_reasons(report.warnings, self.stream.ledger)
+        self._advisor.report_trouble(trouble)
         if self._input.type_name and not self._input.problem:
             self._advisor.report_silence(report.silent_seconds, self._input.topic, self._input.has_publisher)
         # Not before a frame was lifted: CameraInfo may come a little later than the keypoints.
-        if report.frames and lacks_camera_info(self.stream):
+        if report.lifting and lacks_camera_info(self.stream):
             self._advisor.report_model_units(self.stream.describe()["scale_source"])
         self._topics.publish_diagnostics(report)

@@ -35,7 +35,7 @@ def unlike_the_model(model: str, layout: str) -> str:
     """Explain that keypoints hardly fit any shape of a model; both arguments are names."""
     return (
         f"The keypoints of a person hardly fit any shape of model '{model}'. If many persons are counted, their points "
-        f"may have another order than layout '{layout}': set `layout` (paul: --layout) to the one your detector uses. "
+        f"may have another order than layout '{layout}': set `layout` to the one your detector uses. "
         "Or the model has not seen such poses: train it on more."
     )
 
@@ -47,7 +47,7 @@ def wrong_point_count(error: WrongPointCount | UnknownLayout, model: Layout) -> 
     names = [name if name in shipped else f"{name} (the model's own, by the path of its file)" for name in fitting]
     if not names:
         return (
-            f"{sentence(str(error))} No shipped layout that the model can use has that many: set `layout` (paul: "
-            "--layout) to the path of your own."
+            f"{sentence(str(error))} No shipped layout that the model can use has that many: set `layout` to the path "
+            "of your own."
         )
-    return f"{sentence(str(error))} Set `layout` (paul: --layout) to the one your detector uses: {', '.join(names)}."
+    return f"{sentence(str(error))} Set `layout` to the one your detector uses: {', '.join(names)}."

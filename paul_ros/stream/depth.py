@@ -28,6 +28,7 @@ skin of a person who stands sideways. Clothes and arms before the hips add to it
 SIZES = (0.4, 1.4)
 """Limits of a person's size over the model's size. A depth that implies another size is ignored."""
 
+_NOWHERE = 100.0  # metres; an image with a person in it that begins beyond this holds millimetres
 _WINDOW = 0.04  # metres, half the side of the window
 _NEAR = 20_000_000  # ns between the stamps of an image and its depths
 _SET_BACK = 10**9  # ns
@@ -57,7 +58,7 @@ class DepthBuffer:
             stamp: of their keypoints, nanoseconds.
             camera: intrinsics of their image.
             surface: metres from the measured surface to the root.
-            ledger: notes how many depths were used and ignored, and images that cannot be used.
+            ledger: notes how many depths were used and ignored, by their reasons, and images that cannot be used.
         """
         image = min(self._images, key=lambda image: abs(image.stamp - stamp), default=None)
         if image is None or camera is None or lifted.units != "m" or not lifted.ok.any():
@@ -73,8 +74,13 @@ class DepthBuffer:
         known = np.isfinite(factor)
         with np.errstate(invalid="ignore"):
             used = known & (factor >= SIZES[0]) & (factor <= SIZES[1])
+            too_far = bool((factor > SIZES[1]).any())
         ledger.note("depth_used", count=int(used.sum()))
-        ledger.note("depth_disagrees", count=int((known & ~used).sum()))
+        ignored = int((known & ~used).sum())
+        if too_far and image.nearest() > _NOWHERE:
+            ledger.note("depth_in_millimetres", REASONS["depth_in_millimetres"].advice, ignored)
+        else:
+            ledger.note("depth_disagrees", REASONS["depth_disagrees"].advice, ignored)
         factor = np.where(used, factor, 1.0)
         return replace(
             lifted,

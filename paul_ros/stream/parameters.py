@@ -135,7 +135,7 @@ def checked(values: dict[str, Any]) -> dict[str, Any]:
     for parameter in PARAMETERS:
         value = values.get(parameter.name, parameter.default)
         if not parameter.allows(value):
-            raise ParameterError(f"{parameter.name} is {value!r}; it must be {parameter.range}")
+            raise ParameterError(f"`{parameter.name}` is {value!r}; it must be {parameter.range}")
     return {**DEFAULTS, **values}
 
 

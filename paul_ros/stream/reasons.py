@@ -3,41 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from paul_ros.lifted import MAX_DISTANCE
-
-DROP = "drop"
-"""Kind: a whole message was not used."""
-
-PERSON = "person"
-"""Kind: one person was left out of the outputs; the others of its message were lifted."""
-
-NOTE = "note"
-"""Kind: something was irregular or worth counting, but was used."""
-
-
-@dataclass(frozen=True)
-class Reason:
-    """One reason.
-
-    Attributes:
-        slug: key in the ledger, in JSON reports and, after ``dropped_`` or ``noted_``, in /diagnostics.
-        kind: DROP, PERSON or NOTE.
-        what: what happened, one sentence without a full stop.
-        fix: what to do, one or two sentences.
-    """
-
-    slug: str
-    kind: str
-    what: str
-    fix: str
-
-    @property
-    def advice(self) -> str:
-        """Both sentences, for a log line or a report."""
-        return f"{self.what}. {self.fix}"
-
+from paul_ros.stream.reason import AT_ONCE, DROP, MOST, NOTE, PERSON, Reason
 
 _ALL = (
     # --- messages of keypoints that cannot be read
@@ -63,7 +30,7 @@ _ALL = (
         "wrong_point_count",
         DROP,
         "The number of keypoints differs from the layout's",
-        "Set `layout` (paul: `--layout`) to the layout of your detector, or to the path of your own layout file.",
+        "Set `layout` to the layout of your detector, or to the path of your own layout file.",
     ),
     Reason(
         "layout_unknown",
@@ -75,7 +42,7 @@ _ALL = (
         "no_common_names",
         DROP,
         "The message names keypoints, and the layout has none of them",
-        "Set `layout` (paul: `--layout`) to a layout of the same kind of object.",
+        "Set `layout` to a layout of the same kind of object.",
     ),
     Reason(
         "not_2d",
@@ -159,13 +126,14 @@ _ALL = (
         "too_many_persons",
         DROP,
         "The image shows more persons than `max_persons`",
-        "Raise the parameter `max_persons` if the number is right; otherwise check the detector.",
+        "Raise `max_persons` if the number is right; otherwise check the detector.",
     ),
     Reason(
         "missed",
         DROP,
         "Messages were lost on the way, or were replaced by newer ones before they could be lifted",
         "Lower the detector's rate, free the CPU, or set the reliability of publisher and subscription to reliable.",
+        warn_above=0.1,
     ),
     Reason(
         "internal_error",
@@ -203,7 +171,7 @@ _ALL = (
         "person_too_few_points",
         PERSON,
         "A person is left out of the outputs: too few of its keypoints are visible",
-        "Lower the parameter `min_confidence` if the detector is unsure of points that are right.",
+        "Lower `min_confidence` if the detector is unsure of points that are right.",
     ),
     Reason(
         "person_degenerate_points",
@@ -215,13 +183,13 @@ _ALL = (
         "person_too_far",
         PERSON,
         f"A person is left out of the outputs: it would stand more than {MAX_DISTANCE:.0f} m away",
-        "Check camera_info if the person is nearer.",
+        "Check `camera_info` if the person is nearer.",
     ),
     Reason(
         "person_behind_camera",
         PERSON,
         "A person is left out of the outputs: it would stand beside or behind the camera",
-        "Check camera_info and the layout of the keypoints.",
+        "Check `camera_info` and `layout`.",
     ),
     # --- notes
     Reason(
@@ -248,6 +216,7 @@ _ALL = (
         "The frame_id of the keypoints differs from that of CameraInfo",
         "Check that both come from one camera. Let the detector use the optical frame: outputs keep its frame_id and "
         "have x right, y down, z forward.",
+        warn_above=AT_ONCE,
     ),
     Reason(
         "confidence_range",
@@ -265,8 +234,9 @@ _ALL = (
         "unlike_the_model",
         NOTE,
         "The keypoints of a person hardly fit any shape of the model",
-        "If many persons are counted, set `layout` (paul: `--layout`) to the layout of your detector, or train the "
-        "model on more poses.",
+        "If many persons are counted, set `layout` to the layout of your detector, or train the model on more poses.",
+        warn_above=MOST,
+        counts_persons=True,
     ),
     Reason(
         "stamp_backwards",
@@ -285,12 +255,24 @@ _ALL = (
         NOTE,
         "A person was placed at the distance that the depth image shows",
         "No action is needed.",
+        counts_persons=True,
     ),
     Reason(
         "depth_disagrees",
         NOTE,
         "A depth implies an impossible size of the person and is ignored, as when something hides the hips",
-        "If it is counted for most persons, check that `depth` is aligned to the image of the keypoints.",
+        "If it is counted for most persons, check the unit of `depth`, and that it is aligned to the image of the "
+        "keypoints.",
+        warn_above=MOST,
+        counts_persons=True,
+    ),
+    Reason(
+        "depth_in_millimetres",
+        NOTE,
+        "A depth image of floats holds millimetres; 32FC1 means metres, so it is ignored",
+        "Publish `depth` as 16UC1, or divide its values by 1000.",
+        warn_above=AT_ONCE,
+        counts_persons=True,
     ),
     Reason(
         "depth_of_another_size",
@@ -298,14 +280,21 @@ _ALL = (
         "Depth images differ in size from CameraInfo, so they are not aligned to the image of the keypoints and are "
         "ignored",
         "Remap `depth` to the aligned images.",
+        warn_above=AT_ONCE,
     ),
     Reason(
         "depth_of_another_time",
         NOTE,
         "No depth image within 20 ms of the keypoints' stamp had come, so their distances were not measured",
         "Check that both use the same clock and that `depth` has at least the rate of the keypoints.",
+        warn_above=MOST,
     ),
 )
 
 REASONS: dict[str, Reason] = {reason.slug: reason for reason in _ALL}
 """Slug -> Reason, in the order of the documentation: messages, other inputs, persons, notes."""
+
+
+def reason_of(slug: str, kind: str) -> Reason:
+    """Return the row of a reason; adapters of other packages may use reasons that have none."""
+    return REASONS.get(slug) or Reason(slug, PERSON if slug.startswith("person_") else kind, "", "")

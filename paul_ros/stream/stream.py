@@ -283,7 +283,7 @@ class LiftStream:
         if persons > self.max_persons:
             raise MessageError(
                 "too_many_persons",
-                f"The image shows {persons} persons. Raise the parameter `max_persons` above {self.max_persons} if "
+                f"The image shows {persons} persons. Raise `max_persons` above {self.max_persons} if "
                 "that is right; otherwise check the detector.",
             )
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.offline.tables import Row, render
+from paul_ros.offline.tables import Row, figure, render
 from paul_ros.versions import versions
 from training.errors import DataError
 from training.judge.experiments import (
@@ -192,7 +192,12 @@ def bad_runs(row: dict[str, Any]) -> str:
 def _published_parts(figures: dict[str, dict[str, float]]) -> list[str]:
     """Return the table of the published figures; none if no sequence has any."""
     methods = list(dict.fromkeys(method for known in figures.values() for method in known))
-    rows = [(name, *map(known.get, methods)) for name, known in figures.items() if known]
+    why = "no figure is published"
+    rows = [
+        (name, *(figure(known.get(method), f"{method} of {name}", why) for method in methods))
+        for name, known in figures.items()
+        if known
+    ]
     columns = [("sequence", "text"), *((method, ".2f") for method in methods)]
     return [f"published\n{render(columns, rows)}"] if rows else []
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from paul_ros.offline.tables import Row, render
+from paul_ros.offline.tables import Row, figure, render
 from training.judge.experiments import Experiment, Outcome, chosen, groups, outcome_row, summary
 from training.judge.nrsfm import bad_runs
 from training.judge.pictures import COLOURS, legend_above, new_figure, percent_axis, titled
@@ -97,8 +97,9 @@ class Sweep:
         for row in report["summary"]:
             name = row["sequence"] if row["sequence"] != last else ""
             last = row["sequence"]
+            ratio = figure(row["ratio"], "ratio", f"no run is {self.reference}, or its median is 0")
             figures = (row[f"{key}_ne_flip_frame_percent"] for key in _FIGURES)
-            more = (bad_runs(row), row["median_ne_flip_global_percent"], row["ratio"], row["seconds_median"])
+            more = (bad_runs(row), row["median_ne_flip_global_percent"], ratio, row["seconds_median"])
             rows.append((name, self.format(row["value"]), *figures, *more))
         return (
             f"normalised error in % over {report['summary'][0]['runs']} seeds, depth flip per frame\n"
