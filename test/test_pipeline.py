@@ -148,7 +148,7 @@ OPENDR_POINTS = len(load_layout("openpose18").names)
 
 def one_person(node, build, seconds: int, **person) -> None:
     msg = build(LiveMake(), header_of(MAKE, seconds), **person)
-    node.pipeline.on_keypoints(OPENDR if build is opendr else HRI, msg, "/humans/bodies/anna/skeleton2d", 0)
+    node.pipeline.on_keypoints(OPENDR if build is opendr else HRI, msg, "/humans/bodies/anna/skeleton2d", 0, 0)
 
 
 @pytest.fixture
@@ -249,7 +249,7 @@ def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
 
     data = serialize_message(good()(header_of(MAKE)))
     for part in (data[:40], data[:-1], b"", b"\0\1\0\0" + bytes(8) + b"\xff" * 60):
-        lifter_node.pipeline.on_keypoints(CLOUD, part, "/keypoints", 0)
+        lifter_node.pipeline.on_keypoints(CLOUD, part, "/keypoints", 0, 0)
     assert lifter_node.stream.ledger.drops == {"damaged_bytes": 4} and lifter_node.stream.counts["frames"] == 0
-    lifter_node.pipeline.on_keypoints(CLOUD, data, "/keypoints", 0)
+    lifter_node.pipeline.on_keypoints(CLOUD, data, "/keypoints", 0, 0)
     assert lifter_node.stream.counts["lifted"] == 1
