@@ -22,7 +22,9 @@ from paul_ros.ros.output_topics import OutputTopics
 from paul_ros.ros.qos import OVERRIDES, input_qos, subscription_events
 from paul_ros.stream.frame import Frame
 from paul_ros.stream.person_group import SILENCE_SECONDS
+from paul_ros.stream.person_ids import PersonIds
 from paul_ros.stream.reasons import REASONS
+from paul_ros.stream.session import Session
 from paul_ros.stream.stream import LiftStream, open_stream
 
 _SEARCH_SECONDS = 0.05
@@ -41,19 +43,22 @@ class Pipeline:
         stream: the stream in use.
     """
 
-    def __init__(self, node: LifecycleNode, parameters: dict[str, Any], log: ThrottledLog) -> None:
+    def __init__(
+        self, node: LifecycleNode, parameters: dict[str, Any], log: ThrottledLog, person_ids: PersonIds
+    ) -> None:
         """Load the model and make the publishers.
 
         Args:
             node: owner of all publishers, subscriptions and timers.
             parameters: values by name.
             log: of warnings.
+            person_ids: who is who since the process began.
 
         Raises:
             ModelError, LayoutError, ParameterError: a parameter cannot be used.
         """
         self._node, self._log = node, log
-        self.stream = open_stream(**parameters)
+        self.stream = open_stream(**parameters, session=Session(person_ids))
         self._announced_route = self.stream.route
         self._health, self._advisor = Health(time.monotonic()), Advisor(log)
         self._input = KeypointInput(node, "keypoints", parameters["input_type"], self, log)

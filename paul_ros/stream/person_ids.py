@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is who: which ids of persons can be trusted, and the numbers that stand for ids in numeric fields."""
+"""Ids of persons: which of them can be trusted, and the numbers that stand for them in numeric fields."""
 
 from __future__ import annotations
 

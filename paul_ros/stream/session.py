@@ -30,12 +30,13 @@ class Session:
         lift_us: the last lift times in microseconds, of frames with persons.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, person_ids: PersonIds | None = None) -> None:
+        """Begin a session; `person_ids` are those of an earlier session in this process, if there was one."""
         self.intrinsics: Intrinsics | None = None
         self.image_size: tuple[int, int] | None = None
         self.camera_frame = ""
         self.depths = DepthBuffer()
-        self.person_ids = PersonIds()
+        self.person_ids = person_ids or PersonIds()
         self.ledger = Ledger()
         self.counts: Counter[str] = Counter(frames=0, persons=0, lifted=0)
         self.lift_us: deque[float] = deque(maxlen=_LIFT_TIMES_KEPT)
