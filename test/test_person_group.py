@@ -69,6 +69,14 @@ def test_without_a_stamp_pauses_part_the_images():
     assert message.keypoints.persons == 6 and message.keypoints.stamp == message.received == 1000 * MS
 
 
+def test_a_repetition_prolongs_the_burst_and_keeps_the_time_of_the_image():
+    group = group_of(unstamped(0, "1"), unstamped(5, "2", x=2.0), unstamped(9, "1"))
+    assert group.accepts(unstamped(19, "3")) and not group.accepts(unstamped(20, "3"))
+    message = group.take()
+    assert message.keypoints.ids == ("1", "2") and message.keypoints.stamp == 1000 * MS
+    assert message.header == f"header of {1000 * MS}" and group.accepts(unstamped(99, "3"))
+
+
 def test_two_persons_with_one_id_are_two_persons():
     group = group_of(person("0", 1), person("0", 2), person("", 3), person("", 4))
     assert group.take().keypoints.ids == ("0", "0", "", "")

@@ -22,6 +22,7 @@ class PersonGroup:
 
     def __init__(self) -> None:
         self._parts: dict[Hashable, Arrival] = {}
+        self._last: Arrival | None = None
 
     def __len__(self) -> int:
         """Number of messages in the group."""
@@ -29,9 +30,9 @@ class PersonGroup:
 
     def accepts(self, message: Arrival) -> bool:
         """Return whether a message belongs to the group's image; an empty group accepts any."""
-        if not self._parts:
+        last = self._last
+        if last is None:
             return True
-        last = next(reversed(self._parts.values()))
         new, old = message.keypoints, last.keypoints
         prompt = abs(message.received - last.received) <= SILENCE_SECONDS * 1e9
         if (new.frame_id, message.stamped) != (old.frame_id, last.stamped):
@@ -44,13 +45,18 @@ class PersonGroup:
     def add(self, message: Arrival) -> bool:
         """Add a person; return False if the message replaces an earlier one about the same person."""
         about = _subject(message)
-        is_new = about not in self._parts
-        self._parts[about] = message
-        return is_new
+        earlier = self._parts.get(about)
+        self._parts[about] = self._last = message
+        if earlier:
+            # The image keeps the time of its first message.
+            keypoints = replace(message.keypoints, stamp=earlier.keypoints.stamp)
+            self._parts[about] = replace(message, header=earlier.header, keypoints=keypoints)
+        return earlier is None
 
     def take(self) -> Arrival:
         """Return all persons in the order of arrival with the first one's header, and empty the group."""
-        parts, self._parts = list(self._parts.values()), {}
+        parts = list(self._parts.values())
+        self._parts, self._last = {}, None
         return replace(parts[0], keypoints=msg_adapters.join([part.keypoints for part in parts]))
 
     def _knows(self, ids: tuple[str, ...]) -> bool:
