@@ -12,6 +12,7 @@ from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.reasons import REASONS
 
 _NS = 10**9
+_FAR_AHEAD = 86400 * _NS  # ns, a day
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ def complete(header: Any, keypoints: Keypoints2D, received: int, topic: str, cam
     elif not stamped:
         text = f"A stamp has {header.stamp.sec} s and {header.stamp.nanosec} ns. {REASONS['invalid_stamp'].advice}"
         ledger.note("invalid_stamp", text)
+    elif received and stamp > received + _FAR_AHEAD:
+        ledger.note("stamp_ahead", REASONS["stamp_ahead"].advice)
     if not frame_id:
         ledger.note("no_frame", REASONS["no_frame"].advice)
         frame_id = camera

@@ -30,6 +30,7 @@ class PersonIds:
         self._shared: dict[str, int] = {}  # id -> last stamp at which several persons had it
         self._numbers: OrderedDict[int, int] = OrderedDict()  # hash of a text -> its number, the last seen at the end
         self._next = FIRST_ASSIGNED
+        self._last: tuple[tuple[str, ...], np.ndarray] = (), np.empty(0, np.float32)
 
     def identified(self, keypoints: Keypoints2D, ledger: Ledger) -> Keypoints2D:
         """Return the persons of one image with '' for the ids that identify nobody.
@@ -62,7 +63,10 @@ class PersonIds:
         first appear. No number is assigned twice. A text that was not seen while 32768 others were is forgotten, and
         has a new number when it returns. Without an id the number is UNKNOWN, and when no number is left.
         """
-        return np.array([self._number(name) for name in ids], np.float32)
+        # Nearly every image shows the persons of the one before.
+        if ids != self._last[0]:
+            self._last = ids, np.array([self._number(name) for name in ids], np.float32)
+        return self._last[1]
 
     def _number(self, text: str) -> int:
         if not text:

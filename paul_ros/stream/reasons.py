@@ -257,6 +257,12 @@ _ALL = (
         "Correct the clock or the arithmetic of the detector.",
     ),
     Reason(
+        "stamp_ahead",
+        NOTE,
+        "A stamp is more than a day ahead of the clock at its arrival; it is used all the same",
+        "Check the clocks of the machines, and the parameter `use_sim_time`.",
+    ),
+    Reason(
         "no_frame",
         NOTE,
         "The keypoints have no frame_id, so CameraInfo's is used; without a CameraInfo it stays empty",
