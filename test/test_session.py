@@ -121,5 +121,6 @@ def test_a_swap_that_is_refused_changes_nothing(stream):
 def test_all_that_a_session_remembers_is_tested_here():
     """A new attribute needs a test that a swap keeps it."""
     assert set(vars(Session())) == {
-        "intrinsics", "image_size", "camera_frame", "depths", "ledger", "counts", "lift_us", "_last_stamp", "person_ids",
+        "intrinsics", "image_size", "camera_frame", "depths", "ledger", "counts", "lift_us", "_last_stamp",
+        "person_ids",
     }  # fmt: skip
