@@ -71,6 +71,19 @@ def test_the_depth_images_stay(stream, swap):
     assert other.ledger.notes == {"depth_used": 2}
 
 
+def test_shared_ids_and_numbers_of_persons_stay(stream, swap):
+    stream.keypoints(CLOUD, cloud_of(("5", "5"), 0))
+    (number,) = stream.session.person_ids.numbers(("anna",))
+    other = swap(stream)
+    assert other.keypoints(CLOUD, cloud_of(("5", "6"), 33_000_000)).frame.keypoints.ids == ("", "6")
+    assert other.session.person_ids.numbers(("ben", "anna"))[1] == number
+
+
+def cloud_of(ids: tuple[str, ...], nanoseconds: int):
+    xy = seen(PERSONS)
+    return outputs.keypoints_cloud(MAKE, header_of(MAKE, 7, nanoseconds), xy, np.ones(xy.shape[:2]), ids)
+
+
 def test_the_last_stamp_stays(stream, swap):
     stream.keypoints(CLOUD, cloud(seconds=9))
     other = swap(stream)
@@ -109,4 +122,5 @@ def test_all_that_a_session_remembers_is_tested_here():
     """A new attribute needs a test that a swap keeps it."""
     assert set(vars(Session())) == {
         "intrinsics", "image_size", "camera_frame", "depths", "ledger", "counts", "lift_us", "_last_stamp",
+        "person_ids",
     }  # fmt: skip

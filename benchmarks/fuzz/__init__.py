@@ -10,6 +10,8 @@ and then broken in a few places:
   odd lengths and odd text.  Even a drop as `internal_error` is a crash here.
 - junk: the same with values of any type, None, nested rubbish and missing fields.  DDS cannot deliver such messages.
 - cdr: PointCloud2 as bytes, for the reader of serialised messages.  rosbags must read the same from them.
+- ids: images whose persons have odd or equal ids, from detectors that send no stamps or no frames.  An oracle knows
+  which persons belong together, and their ids, numbers and stamps.
 - bags: bits flipped, bytes cut off, inserted and exchanged, and intact bags of broken messages; read and replayed.
 - scenes: persons before cameras with distortion, windows and binning, in messages whose pixels, confidences, ids or
   order mean something else.  The truth is known.

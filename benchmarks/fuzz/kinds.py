@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 
 from benchmarks.fuzz.bench import Bench
+from benchmarks.fuzz.identities import ids_session
 from benchmarks.fuzz.recordings import recording_session
 from benchmarks.fuzz.requests import request_session
 from benchmarks.fuzz.scenes import scene_session
@@ -32,6 +33,7 @@ SESSIONS: dict[str, Session] = {
     "junk": junk_session,
     "cdr": cdr_session,
     "scenes": scene_session,
+    "ids": ids_session,
     "bags": bag_session,
     "recordings": recording_session,
     "models": model_session,
@@ -45,7 +47,8 @@ SHARES = {
     "fields": 0.20,
     "junk": 0.10,
     "cdr": 0.15,
-    "scenes": 0.30,
+    "scenes": 0.22,
+    "ids": 0.08,
     "bags": 0.04,
     "recordings": 0.05,
     "models": 0.04,

@@ -229,7 +229,7 @@ class _OfflineNode:
         self._decode(record, "keypoints", lambda message: self._lift(record, message), *msg_adapters.SUPPORTED)
 
     def _lift(self, record: Record, message: Any) -> None:
-        answer = self.done.stream.keypoints(record.type_name, message, record.topic)
+        answer = self.done.stream.keypoints(record.type_name, message, record.topic, record.log_time)
         self._write_layout(record.log_time)
         self._take_frame(answer.frame)
 

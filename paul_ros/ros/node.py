@@ -2,7 +2,7 @@
 """The ROS 2 node `lifter`: its life cycle and its parameters. `pipeline` has the data path.
 
 It subscribes to `keypoints` (2D), `camera_info` and `depth` (both optional). It publishes ~/poses, ~/bodies,
-~/keypoints3d, ~/markers, ~/layout and /diagnostics. Headers are the input's own.
+~/persons, ~/keypoints3d, ~/markers, ~/layout and /diagnostics. Headers are the input's own.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from paul_ros.ros.rclpy_internals import destroy_lifecycle_publishers, lifecycle
 from paul_ros.ros.services import guard_services
 from paul_ros.stream.advice import sentence
 from paul_ros.stream.parameters import LIVE
+from paul_ros.stream.person_ids import PersonIds
 from paul_ros.stream.stream import LiftStream, open_stream
 
 _SWITCHING = ("model", "layout", "output_layout")
@@ -57,6 +58,8 @@ class LifterNode(LifecycleNode):
         if self._unknown:
             self.get_logger().warning(sentence(f"Unknown parameters are ignored: {'; '.join(self._unknown)}"))
         self._pipeline: Pipeline | None = None
+        # Numbers of persons outlive a cleanup: listeners may still hold them.
+        self._person_ids = PersonIds()
         self._refusal: Exception | None = None
         self._starting = False
         self._final_summary = "nothing was lifted"
@@ -117,7 +120,7 @@ class LifterNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the model and make the publishers; fails, and may be repeated, if a parameter cannot be used."""
         try:
-            self._pipeline = Pipeline(self, self._values, self._log)
+            self._pipeline = Pipeline(self, self._values, self._log, self._person_ids)
         except REFUSALS as error:
             self._clean_up()
             return self._refuse(error)
