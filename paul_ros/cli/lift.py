@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_layout, add_person_height
+from paul_ros.cli.options import Commands, HelpFormatter, add_image, add_model, add_output_layout, add_person_height
 from paul_ros.cli.output import STDOUT, check_files, open_output
 from paul_ros.cli.progress import progress
 from paul_ros.stream.parameters import DEFAULTS
@@ -56,8 +56,8 @@ output, in the optical frame of the camera (x right, y down, z forward):
 A csv has a row for each keypoint, with root_x, root_y, root_z. In json, `persons` is a list of
 objects.
 
-The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that
-camera_calibration wrote, or JSON such as:
+--image says whether the keypoints lie in the raw or in the rectified image. FILE is a YAML file
+that camera_calibration wrote, a CameraInfo message as YAML, or JSON such as:
   {"K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], "width": 1280, "height": 720}
 
 examples:
@@ -101,6 +101,7 @@ def add_parser(commands: Commands) -> None:
         nargs=4,
         help="focal lengths and principal point in pixels",
     )
+    add_image(parser)
     add_model(parser)
     add_person_height(parser)
     parser.add_argument(
@@ -191,11 +192,8 @@ def _notes(tally: Counter[str], camera: Intrinsics | None, layout: str) -> list[
     notes = []
     if camera is None:
         notes.append("note: no camera, so lengths are in model units; give --camera or --intrinsics for metres")
-    elif camera.distorted:
-        notes.append(
-            "note: the camera has distortion but no P, so K is used: positions are a little wrong unless the keypoints "
-            "are of an undistorted image"
-        )
+    else:
+        notes += [f"note: {note.advice}" for note in camera.notes]
     if tally[_UNLIKE]:
         notes.append(
             f"note: no shape of the model fits {tally[_UNLIKE]} of the persons well; if the keypoints are not in the "
@@ -219,7 +217,7 @@ def _camera(args: argparse.Namespace) -> Intrinsics | None:
     from paul_ros.offline.camera_file import camera_of, read_camera
 
     if args.camera:
-        return read_camera(args.camera)
+        return read_camera(args.camera, args.image or "auto")
     return camera_of(*args.intrinsics) if args.intrinsics else None
 
 

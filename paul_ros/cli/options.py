@@ -10,6 +10,8 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from paul_ros.stream.parameters import IMAGES
+
 if TYPE_CHECKING:
     Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 else:
@@ -56,6 +58,16 @@ def add_person_height(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="METRES",
         help="height of the people in metres (default: the model's mean adult)",
+    )
+
+
+def add_image(parser: argparse.ArgumentParser) -> None:
+    """Add --image, the image of the keypoints."""
+    parser.add_argument(
+        "--image",
+        choices=IMAGES,
+        help="the image that the detector saw: rectified (P of the camera), raw (K; the distortion D is corrected), "
+        "or auto: raw if D is not zero and P is empty or equals K (default: auto)",
     )
 
 

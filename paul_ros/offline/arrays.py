@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from msg_adapters import Intrinsics
+from msg_adapters import Intrinsics, in_pinhole
 from msg_adapters.keypoints import Keypoints2D, record
 from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout
@@ -90,7 +90,7 @@ def lift_persons(
         batches: persons in the layout `route.given`.
         lifter: lifts in the model's layout.
         route: layouts of input and output.
-        camera: intrinsics of the rectified image; None gives model units.
+        camera: camera of the image, whose distortion is corrected; None gives model units.
         min_confidence: keypoints below it count as hidden.
 
     Yields:
@@ -98,5 +98,6 @@ def lift_persons(
     """
     for batch in batches:
         keypoints = Keypoints2D(batch.xy, batch.confidence, batch.visible, batch.person, 0, "")
+        keypoints = in_pinhole(keypoints, camera)
         seen = route.keypoints_in(keypoints, min_confidence)
         yield batch, route.lifted_out(lifter.lift_in_model_layout(seen.xy, seen.visible, camera))

@@ -16,6 +16,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 import msg_adapters
 from paul_ros.ros.advisor import Advisor, ThrottledLog
+from paul_ros.ros.camera_input import subscribe_camera_info
 from paul_ros.ros.diagnostics import Health, lacks_camera_info
 from paul_ros.ros.keypoint_input import KeypointInput
 from paul_ros.ros.output_topics import OutputTopics
@@ -75,7 +76,9 @@ class Pipeline:
         self._health = Health(time.monotonic(), self.stream.ledger.drops, self.stream.ledger.notes)
         # Discovery takes its time: an absent publisher is worth a warning only after a while.
         self._log.hold("no input")
-        self._subscribe(CameraInfo, "camera_info", self._on_camera_info)
+        self._subscriptions += subscribe_camera_info(
+            self._node, "camera_info", self._on_camera_info, self.on_qos_mismatch
+        )
         self._subscribe(Image, "depth", self._on_depth)
         self._group_ticks = 0
         self._group_timer = self._timer(_GROUP_SECONDS, self._on_group_tick, autostart=False)

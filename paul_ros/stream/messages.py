@@ -106,13 +106,17 @@ def _point_values(frame: Frame) -> np.ndarray:
 
 
 def project(points: np.ndarray, camera: Intrinsics | None) -> np.ndarray:
-    """Project points (...,3) of the camera's frame to pixels (...,2); NaN behind the camera, or without one."""
+    """Project points (...,3) of the camera's frame to pixels (...,2) of the keypoints' image, raw or rectified.
+
+    They are NaN behind the camera, where the lens shows nothing, and without a camera.
+    """
     pixels = np.full((*points.shape[:-1], 2), np.nan)
     if camera is None:
         return pixels
     ahead = points[..., 2] > 0
     x, y, z = points[ahead].T
-    pixels[ahead] = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    pinhole = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    pixels[ahead] = camera.to_image(pinhole)
     return pixels
 
 
