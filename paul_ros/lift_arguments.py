@@ -90,7 +90,10 @@ def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
         return None
     if isinstance(camera, Intrinsics):
         if not _plausible(camera.fx, camera.fy, camera.cx, camera.cy):
-            raise InputError(f"camera {camera} is no camera: its focal lengths must be {_LIMITS} pixels, all finite")
+            raise InputError(
+                f"camera has fx {camera.fx!r}, fy {camera.fy!r}, cx {camera.cx!r}, cy {camera.cy!r}: pass numbers "
+                f"that are finite, and focal lengths of {_LIMITS} pixels"
+            )
         return camera
     if hasattr(camera, "k") and hasattr(camera, "p"):
         try:
