@@ -14,9 +14,11 @@ from test_depth import depth_image
 from test_distortion import forward
 
 from msg_adapters import MessageError, image_size, in_pinhole, outputs, read, read_camera_info
+from paul_ros.cli import options
 from paul_ros.lifter import Lifter
 from paul_ros.stream.depth import SURFACE
 from paul_ros.stream.messages import project
+from paul_ros.stream.parameters import IMAGES
 from paul_ros.stream.stream import LiftStream, open_stream
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -249,6 +251,10 @@ def test_an_image_that_cannot_be_read_is_a_counted_drop(opened, model_file):
     stream.camera_info(info(k=(0, 0, 0, 0), p=OTHER))
     other = open_stream(str(model_file), session=stream.session, image="raw")
     assert other.ledger.drops == {"bad_intrinsics": 1} and other.intrinsics.matrix == "P"
+
+
+def test_commands_and_node_know_the_same_images():
+    assert options.IMAGES == IMAGES
 
 
 def test_another_image_is_refused(model_file):

@@ -8,6 +8,7 @@ import pytest
 from conftest import persons_at, seen
 from test_camera_info import CLOUD, cloud, info
 
+from msg_adapters import Keypoints2D
 from paul_ros.ros.diagnostics import OK, WARN, Health
 from paul_ros.stream.image_bounds import CORNER_MESSAGES, ImageBounds
 from paul_ros.stream.ledger import Ledger
@@ -22,10 +23,16 @@ def box(left: float, top: float, right: float, bottom: float) -> np.ndarray:
     return np.vstack([inside, [(left, top), (right, bottom)]])
 
 
+def record(xy: np.ndarray) -> Keypoints2D:
+    """Return points (M,2) as a person's keypoints."""
+    seen = np.isfinite(xy).all(1)[None]
+    return Keypoints2D(xy[None], seen.astype(float), seen, ("1",), 0, "")
+
+
 def notes(*messages: np.ndarray, size: tuple[int, int] = SIZE) -> Ledger:
     ledger, bounds = Ledger(), ImageBounds()
     for xy in messages:
-        bounds.check(xy, size, ledger)
+        bounds.check(record(xy), 0.3, size, ledger)
     return ledger
 
 
@@ -36,6 +43,8 @@ def notes(*messages: np.ndarray, size: tuple[int, int] = SIZE) -> Ledger:
         (box(-63, -47, 703, 527), False),  # a detector guesses just beyond the border
         (np.vstack([box(0, 0, 640, 480), [[5000, 5000]]]), False),  # one wild point
         (np.empty((0, 2)), False),
+        (np.full((17, 2), np.nan), False),
+        (np.vstack([box(705, 100, 900, 400), np.full((17, 2), np.nan)]), True),
         (box(705, 100, 900, 400), True),
         (box(100, 100, 1900, 1060), True),
         (box(100, 300, 500, 900), True),
@@ -56,9 +65,8 @@ def test_the_advice_names_both_sizes_and_the_farthest_reach():
 
 def test_another_size_starts_anew():
     ledger, bounds = Ledger(), ImageBounds()
-    bounds.check(box(100, 100, 1900, 1060), SIZE, ledger)
-    bounds.check(box(100, 100, 1900, 1060), (1920, 1080), ledger)
-    bounds.check(box(100, 100, 2900, 1060), (1920, 1080), ledger)
+    for right, size in ((1900, SIZE), (1900, (1920, 1080)), (2900, (1920, 1080))):
+        bounds.check(record(box(100, 100, right, 1060)), 0.3, size, ledger)
     assert ledger.notes == {"outside_image": 2} and "2900x1060" in ledger.advice["outside_image"]
 
 

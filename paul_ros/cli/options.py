@@ -10,12 +10,13 @@ import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from paul_ros.stream.parameters import IMAGES
-
 if TYPE_CHECKING:
     Commands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
 else:
     Commands = argparse._SubParsersAction
+
+IMAGES = ("auto", "rectified", "raw")
+"""Values of the parameter `image`; its table needs PyYAML, which no command may import before it runs."""
 
 PICTURES = (".png", ".svg", ".pdf")
 """Suffixes of a picture."""

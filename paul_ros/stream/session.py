@@ -70,8 +70,7 @@ class Session:
     def in_pinhole(self, keypoints: Keypoints2D, min_confidence: float) -> Keypoints2D:
         """Compare keypoints, as the adapter read them, with the image, and correct the distortion of the camera."""
         if self.image_size:
-            sure = keypoints.visible & (keypoints.confidence >= min_confidence)
-            self._bounds.check(keypoints.xy[sure], self.image_size, self.ledger)
+            self._bounds.check(keypoints, min_confidence, self.image_size, self.ledger)
         corrected = in_pinhole(keypoints, self.intrinsics)
         if corrected is not keypoints:
             hidden = int(keypoints.visible.sum() - corrected.visible.sum())
