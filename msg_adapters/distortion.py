@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 _EQUIDISTANT = "equidistant"
-#: Model -> allowed numbers of coefficients. Trailing zeros beyond these are ignored.
-_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (4, 5, 8, 12), _EQUIDISTANT: (4,)}
+#: Model -> allowed numbers of coefficients. Trailing zeros beyond these are ignored. Drivers send eight numbers under the
+#: name plumb_bob too: both names stand for OpenCV's polynomial of that many coefficients.
+_COUNTS = {"plumb_bob": (4, 5, 8, 12), "rational_polynomial": (4, 5, 8, 12), _EQUIDISTANT: (4,)}
 #: Largest plausible coefficient; others come from uninitialised memory or from a calibration that failed.
 _MAX_COEFFICIENT = 1e6
 #: Smallest plausible angle from the axis at which a polynomial may fold the image back.
@@ -99,8 +100,7 @@ def read_distortion(model: str, coefficients: Sequence[float]) -> Distortion | N
     while len(values) > counts[-1] and not values[-1]:
         values.pop()
     if len(values) not in counts:
-        allowed = " or ".join(map(str, counts))
-        raise ValueError(f"D has {len(coefficients)} numbers, and {model} has {allowed}")
+        raise ValueError(f"D has {len(coefficients)} numbers, and {model} takes {', '.join(map(str, counts))}")
     size = 4 if model == _EQUIDISTANT else 12
     lens = Distortion(model, (*values, *[0.0] * (size - len(values))))
     if (border := _table(lens)[0][-1]) < _MIN_ANGLE:

@@ -7,6 +7,7 @@ import array
 import math
 from typing import Any
 
+import foreign_messages as foreign
 import numpy as np
 import pytest
 from conftest import CENTRE, FOCAL, RosMake, camera_info, header_of, persons_at
@@ -17,7 +18,7 @@ from msg_adapters import MessageError, image_size, in_pinhole, outputs, read, re
 from paul_ros.cli import options
 from paul_ros.lifter import Lifter
 from paul_ros.stream.depth import SURFACE
-from paul_ros.stream.messages import project
+from paul_ros.stream.messages import image_pixels, project
 from paul_ros.stream.parameters import IMAGES
 from paul_ros.stream.stream import LiftStream, open_stream
 
@@ -311,10 +312,27 @@ def test_depths_are_read_where_the_raw_image_shows_the_root(opened):
     assert stream.ledger.notes == {"depth_used": 1}
 
 
-def test_annotations_lie_on_the_raw_image():
-    truth = persons_at((1.4, 0.0, 3.0))
-    camera = read_camera_info(info(d=BARREL))
-    np.testing.assert_allclose(project(truth, camera), raw_pixels(truth, BARREL), atol=1e-6)
+def test_annotations_and_films_lie_on_the_raw_image(opened):
+    truth, stream = persons_at((1.4, 0.0, 3.0)), opened()
+    raw = raw_pixels(truth, BARREL)
+    stream.camera_info(info(d=BARREL))
+    frame = stream.keypoints(CLOUD, cloud(raw)).frame
+    np.testing.assert_allclose(project(truth, frame.camera), raw, atol=1e-6)
+    np.testing.assert_allclose(image_pixels(frame.keypoints, frame.camera), raw, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "message", [info(binning=(2, 2)), info(roi=(100, 50, 400, 400)), info(roi=(100, 50, 400, 400), binning=(4, 4))]
+)
+def test_shares_of_the_image_are_those_of_the_delivered_image(opened, bag_make, message):
+    stream, truth = opened(), persons_at((0.2, 0.0, 4.0))
+    stream.camera_info(message)
+    offset = np.array((message.roi.x_offset, message.roi.y_offset))
+    size = np.array((message.roi.width or 640, message.roi.height or 480))
+    shares = (truth[0, :, :2] / truth[0, :, 2:] * FOCAL + CENTRE - offset) / size
+    pose = dict(zip(stream.route.given.names, shares * foreign.SIZE))
+    stream.keypoints(foreign.HRI, foreign.hri(bag_make, header_of(bag_make), pose))
+    np.testing.assert_allclose(stream.flush().lifted.root, hips(truth), atol=0.03)
 
 
 # --- for arrays

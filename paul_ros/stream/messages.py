@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_adapters import Intrinsics, outputs
+from msg_adapters import Intrinsics, Keypoints2D, outputs
 from msg_adapters.cdr import CloudWriter, PoseArrayWriter
 from msg_adapters.factory import MessageFactory
 from paul_ros.body_axes import ContinuousSigns
@@ -103,6 +103,11 @@ def _point_columns(frame: Frame) -> tuple[np.ndarray, ...]:
 
 def _point_values(frame: Frame) -> np.ndarray:
     return outputs.point_values(*_point_columns(frame))
+
+
+def image_pixels(keypoints: Keypoints2D, camera: Intrinsics | None) -> np.ndarray:
+    """Return keypoints that the stream has undistorted as pixels (N,P,2) of their own image, raw or rectified."""
+    return keypoints.xy if camera is None else camera.to_image(keypoints.xy)
 
 
 def project(points: np.ndarray, camera: Intrinsics | None) -> np.ndarray:
