@@ -50,7 +50,7 @@ def read_camera_info(msg: Any, image: str = "auto") -> Intrinsics:
 
     Raises:
         MessageError: bad_intrinsics. A number is not finite, is zero (the camera is not calibrated), or is out of
-            proportion to the image (K is normalised); or the region of interest or the binning is impossible.
+            proportion to the image (K is normalised). Or the region of interest or the binning is impossible.
     """
     window = _window(msg)
     p, k = ([float(matrix[index]) for index in at] for matrix, at in ((msg.p, (0, 5, 2, 6)), (msg.k, (0, 4, 2, 5))))

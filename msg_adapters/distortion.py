@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 _EQUIDISTANT = "equidistant"
-#: Model -> allowed numbers of coefficients. Trailing zeros beyond these are ignored. Drivers send eight numbers under the
-#: name plumb_bob too: both names stand for OpenCV's polynomial of that many coefficients.
+#: Model -> allowed numbers of coefficients. Trailing zeros beyond these are ignored. Drivers send eight numbers as
+#: plumb_bob too, so both names stand for OpenCV's polynomial of that many coefficients.
 _COUNTS = {"plumb_bob": (4, 5, 8, 12), "rational_polynomial": (4, 5, 8, 12), _EQUIDISTANT: (4,)}
 #: Largest plausible coefficient; others come from uninitialised memory or from a calibration that failed.
 _MAX_COEFFICIENT = 1e6

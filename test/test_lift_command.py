@@ -341,6 +341,15 @@ def test_the_image_of_the_keypoints_is_stated(persons, model_file, tmp_path, cap
     assert np.abs(results["raw"] - results["rectified"]).max() > 0.02
 
 
+def test_keypoints_outside_the_image_of_the_camera_file_are_noted(persons, model_file, tmp_path, capsys):
+    camera = {"K": [FOCAL, 0, CENTRE[0], 0, FOCAL, CENTRE[1], 0, 0, 1], "width": 640, "height": 480}
+    (tmp_path / "c.json").write_text(json.dumps(camera))
+    for factor in (1, 3):
+        source = npz(tmp_path / "in.npz", keypoints=factor * persons[..., :2])
+        assert lift(source, tmp_path / f"{factor}.npz", model_file, "--camera", tmp_path / "c.json") == 0
+        assert ("CameraInfo states an image of 640x480" in capsys.readouterr().out) == (factor == 3)
+
+
 @pytest.mark.parametrize(
     "text, size",
     [

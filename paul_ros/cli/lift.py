@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from msg_adapters import Intrinsics
     from paul_ros.lifter import Lifter
     from paul_ros.offline.lifted_files import Batches
+    from paul_ros.stream.session import Session
 
 FORMATS = ("npz", "csv", "json")
 
@@ -147,8 +148,11 @@ def _lift(
     from paul_ros.offline.keypoint_files import open_keypoints
     from paul_ros.offline.lifted_files import LiftedFile
     from paul_ros.route import Route, find_output_layout
+    from paul_ros.stream.session import Session
 
-    camera, model = _camera(args), lifter.model
+    camera, model, session = _camera(args), lifter.model, Session()
+    if camera:
+        session.take_camera(camera)
     units = "m" if camera and lifter.metres_per_unit else "model"
     with _open_input(args.input) as file:
         layout = load_layout(args.layout) if args.layout else None
@@ -156,10 +160,10 @@ def _lift(
         keypoints = open_keypoints(file, name, kinds[0], layout, model.layout)
         output = find_output_layout(args.output_layout, model.layout)
         route = Route.between(keypoints.layout, model.layout, output)
-        lifted = lift_persons(keypoints.batches, lifter, route, camera, min_confidence)
+        lifted = lift_persons(keypoints.batches, lifter, route, session, min_confidence)
         with open_output(args.output) as out, progress("lift", "person", keypoints.persons) as count:
             LiftedFile(route.output, model, units).write(out, kinds[1], _counted(lifted, tally, count))
-    return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, camera, route.given.name)])
+    return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, session, route.given.name)])
 
 
 def _counted(batches: Batches, tally: Counter[str], count: Callable[[int], None]) -> Batches:
@@ -188,12 +192,11 @@ def _reasons(tally: Counter[str]) -> str:
     return ", ".join(f"{number} {reason}" for reason, number in left_out)
 
 
-def _notes(tally: Counter[str], camera: Intrinsics | None, layout: str) -> list[str]:
+def _notes(tally: Counter[str], session: Session, layout: str) -> list[str]:
     notes = []
-    if camera is None:
+    if session.intrinsics is None:
         notes.append("note: no camera, so lengths are in model units; give --camera or --intrinsics for metres")
-    else:
-        notes += [f"note: {note.advice}" for note in camera.notes]
+    notes += [f"note: {advice}" for advice in session.ledger.advice.values()]
     if tally[_UNLIKE]:
         notes.append(
             f"note: no shape of the model fits {tally[_UNLIKE]} of the persons well; if the keypoints are not in the "

@@ -13,7 +13,7 @@ import yaml
 from paul_ros.errors import ParameterError
 
 IMAGES = ("auto", "rectified", "raw")
-"""What may be stated about the image of the keypoints; see `msg_adapters.read_camera_info`."""
+"""Values of `image`; `msg_adapters.read_camera_info` has the rule of the first."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ PARAMETERS = (
     Parameter(
         "image",
         "auto",
-        "The image that the detector sees, one of the two that CameraInfo describes: `rectified` (P), `raw` (K; the "
-        "distortion D is corrected), or `auto`. `auto` takes it as raw if D is not zero and P is empty or equals K.",
+        "The image that the detector sees: `rectified` (P of CameraInfo), or `raw` (K; the distortion D is corrected). "
+        "`auto` takes it as raw if D is not zero and P is empty or equals K.",
         live=True,
         choices=IMAGES,
     ),

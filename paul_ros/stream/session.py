@@ -53,8 +53,16 @@ class Session:
         self.camera_frame = str(msg.header.frame_id)
         # An uncalibrated camera has a size too.
         self.image_size = image_size(msg)
-        self._take(read_camera_info(msg, self.image))
+        self.take_camera(read_camera_info(msg, self.image))
         self._camera_info = msg
+
+    def take_camera(self, camera: Intrinsics) -> None:
+        """Use a camera from now on. Count its notes only if they are new: CameraInfo comes with each image."""
+        known = self.intrinsics.notes if self.intrinsics else ()
+        for note in camera.notes:
+            if note not in known:
+                self.ledger.note(note.reason, note.advice)
+        self.intrinsics, self.image_size = camera, (camera.width, camera.height)
 
     def choose_image(self, image: str) -> None:
         """Take another image for that of the keypoints; the last usable CameraInfo is read again."""
@@ -63,7 +71,7 @@ class Session:
         self.image = image
         if self._camera_info is not None:
             try:
-                self._take(read_camera_info(self._camera_info, image))
+                self.take_camera(read_camera_info(self._camera_info, image))
             except MessageError as error:
                 self.ledger.drop(error.reason, str(error))
 
@@ -76,14 +84,6 @@ class Session:
             hidden = int(keypoints.visible.sum() - corrected.visible.sum())
             self.ledger.note("no_ray", REASONS["no_ray"].advice, hidden)
         return corrected
-
-    def _take(self, camera: Intrinsics) -> None:
-        """Use a camera from now on. Count its notes only if they are new: CameraInfo comes with each image."""
-        known = self.intrinsics.notes if self.intrinsics else ()
-        for note in camera.notes:
-            if note not in known:
-                self.ledger.note(note.reason, note.advice)
-        self.intrinsics = camera
 
     def check_header(self, stamp: int, frame_id: str) -> None:
         """Note a stamp (nanoseconds) that runs backwards, and a frame that is not the camera's."""
