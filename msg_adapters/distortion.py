@@ -136,10 +136,10 @@ def _solve_polynomial(lens: Distortion, ray: np.ndarray, position: np.ndarray) -
     for _ in range(_MAX_STEPS):
         reached, by_ray, by_conjugate = _polynomial(lens, ray)
         error = position - reached
-        determinant = np.abs(by_ray) ** 2 - np.abs(by_conjugate) ** 2
-        solved = (np.abs(error) <= _TOLERANCE) & (determinant > 0)
+        solved = np.abs(error) <= _TOLERANCE
         if solved.all():
             break
+        determinant = np.abs(by_ray) ** 2 - np.abs(by_conjugate) ** 2
         # The solution of by_ray * step + by_conjugate * conj(step) = error.
         ray = ray + (by_ray.conj() * error - by_conjugate * error.conj()) / determinant
         # A step too far could reach a solution beyond the border, where the image folds back.

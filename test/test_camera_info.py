@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import array
+import json
 import math
 from typing import Any
 
@@ -15,8 +16,12 @@ from test_depth import depth_image
 from test_distortion import forward
 
 from msg_adapters import MessageError, image_size, in_pinhole, outputs, read, read_camera_info
+from paul_ros import cli
 from paul_ros.cli import options
 from paul_ros.lifter import Lifter
+from paul_ros.offline.bag_reader import read_messages
+from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.stream.depth import SURFACE
 from paul_ros.stream.messages import image_pixels, project
 from paul_ros.stream.parameters import IMAGES
@@ -37,7 +42,7 @@ def info(
     msg = camera_info(make)
     msg.k = np.array([k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1.0])
     msg.p = np.array([p[0], 0, p[2], 0, 0, p[1], p[3], 0, 0, 0, 1.0, 0])
-    msg.d, msg.distortion_model = array.array("d", d), model
+    msg.d, msg.distortion_model = array.array("d", d) if make is MAKE else np.array(d), model
     msg.width, msg.height = size
     msg.binning_x, msg.binning_y = binning
     msg.roi.x_offset, msg.roi.y_offset, msg.roi.width, msg.roi.height = roi
@@ -51,9 +56,9 @@ def raw_pixels(points: np.ndarray, d, model="plumb_bob", k=PLAIN) -> np.ndarray:
     return np.reshape(flat, normalised.shape) * k[:2] + np.array(k[2:])
 
 
-def cloud(xy: np.ndarray, seconds: int = 7, confidence: np.ndarray | None = None):
+def cloud(xy: np.ndarray, confidence: np.ndarray | None = None, make=MAKE):
     sure = np.ones(xy.shape[:2]) if confidence is None else confidence
-    return outputs.keypoints_cloud(MAKE, header_of(MAKE, seconds), xy, sure, [str(row) for row in range(len(xy))])
+    return outputs.keypoints_cloud(make, header_of(make), xy, sure, [str(row) for row in range(len(xy))])
 
 
 @pytest.fixture
@@ -357,3 +362,22 @@ def test_the_numbers_of_the_image_do_not_depend_on_its_resolution(size):
     expected = [forward("plumb_bob", BARREL, *ray) for ray in rays.tolist()]
     np.testing.assert_allclose((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), expected)
     assert math.isclose(camera.fx, size * FOCAL)
+
+
+# --- from the command line
+
+
+def test_replay_and_film_take_the_image(model_file, tmp_path, capsys):
+    truth, bag, make = persons_at((1.4, 0.0, 3.0)), tmp_path / "in.mcap", BagMessages()
+    with BagWriter(bag, make) as writer:
+        writer.write("/camera_info", info(p=OTHER, d=BARREL, make=make), 0)
+        writer.write("/keypoints", cloud(raw_pixels(truth, BARREL), make=make), 1)
+    for image, far in (("raw", False), ("auto", True)):
+        arguments = ["replay", str(bag), "--model", str(model_file), "--image", image]
+        assert cli.main([*arguments, "-o", str(tmp_path / "out.mcap"), "--json", "-"]) == 0
+        assert json.loads(capsys.readouterr().out)["noted"] == ({"image_assumed": 1} if far else {})
+        (body,) = (m.poses[0].position for t, _, m, _ in read_messages(tmp_path / "out.mcap") if t == "/lifter/bodies")
+        off = np.linalg.norm(np.array((body.x, body.y, body.z)) - hips(truth)[0])
+        assert (off > 0.1) == far and (off < 0.03) != far
+    view = ["view", str(bag), "--model", str(model_file), "--image", "raw", "-o", str(tmp_path / "film.png")]
+    assert cli.main(view) == 0 and (tmp_path / "film.png").stat().st_size > 1000
