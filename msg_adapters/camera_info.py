@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_adapters.distortion import Distortion, read_distortion
+from msg_adapters.distortion import EQUIDISTANT, Distortion, read_distortion
 from msg_adapters.keypoints import Intrinsics, MessageError, Note
 
 #: Limits of a focal length in multiples of the image's larger side.
@@ -36,7 +36,8 @@ def read_camera_info(msg: Any, image: str = "auto") -> Intrinsics:
 
     The rule of 'auto', in this order:
 
-    - D is zero or empty: both images are equal. P is used if it is filled.
+    - D is zero or empty: both images are equal. P is used if it is filled. For equidistant, whose formula with zeros is
+      no pinhole camera, this is noted as `image_assumed`.
     - P is not filled: raw.
     - P equals K: raw, since no rectification leaves K as it is; the driver copied it.
     - Otherwise: rectified, noted as `image_assumed`.
@@ -62,6 +63,8 @@ def read_camera_info(msg: Any, image: str = "auto") -> Intrinsics:
     notes = []
     if image == "auto" and taken == "rectified" and distorted:
         notes.append(Note("image_assumed", _ASSUMED))
+    if image != "rectified" and not distorted and len(msg.d) and str(msg.distortion_model) == EQUIDISTANT:
+        notes.append(Note("image_assumed", _NO_FISHEYE))
     if image == "rectified" and not filled:
         notes.append(Note("rectified_without_p", _WITHOUT_P))
     distortion, uncorrected = _distortion(msg) if taken == "raw" else (None, "")
@@ -95,6 +98,10 @@ def image_size(msg: Any) -> tuple[int, int]:
 _ASSUMED = (
     "CameraInfo has distortion, and its P differs from K, so the keypoints are taken as those of the rectified image. "
     "Set `image` to raw if the detector sees the raw image, or to rectified to confirm."
+)
+_NO_FISHEYE = (
+    "CameraInfo names the model equidistant, and its D is zero, so the image is taken to have no distortion, as "
+    "image_geometry does. Publish the lens's coefficients if the image is a fisheye's."
 )
 _WITHOUT_P = (
     "`image` is rectified, but P of CameraInfo is not filled, so K is used. Let the camera's driver fill P, or set "

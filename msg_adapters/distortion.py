@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_EQUIDISTANT = "equidistant"
+#: The model of fisheye lenses.
+EQUIDISTANT = "equidistant"
 #: Model -> allowed numbers of coefficients. Trailing zeros beyond these are ignored. Drivers send eight numbers as
 #: plumb_bob too, so both names stand for OpenCV's polynomial of that many coefficients.
-_COUNTS = {"plumb_bob": (4, 5, 8, 12), "rational_polynomial": (4, 5, 8, 12), _EQUIDISTANT: (4,)}
+_COUNTS = {"plumb_bob": (4, 5, 8, 12), "rational_polynomial": (4, 5, 8, 12), EQUIDISTANT: (4,)}
 #: Largest plausible coefficient; others come from uninitialised memory or from a calibration that failed.
 _MAX_COEFFICIENT = 1e6
 #: Smallest plausible angle from the axis at which a polynomial may fold the image back.
@@ -55,7 +56,7 @@ class Distortion:
         ray = _as_complex(rays)
         tangent = np.abs(ray)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            if self.model == _EQUIDISTANT:
+            if self.model == EQUIDISTANT:
                 position = ray * _distorted_angle(self, np.arctan(tangent)) / np.maximum(tangent, _TINY)
             else:
                 position, *_ = _polynomial(self, ray)
@@ -69,7 +70,7 @@ class Distortion:
         # The radial terms alone, inverted by a table, are a start close to the solution.
         angle = np.interp(radius, radii, angles)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            if self.model == _EQUIDISTANT:
+            if self.model == EQUIDISTANT:
                 angle, solved = _solve_angle(self, angle, radius)
                 return _as_pairs(position * np.tan(angle) / np.maximum(radius, _TINY), solved)
             start = position * np.tan(angle) / np.maximum(radius, _TINY)
@@ -101,7 +102,7 @@ def read_distortion(model: str, coefficients: Sequence[float]) -> Distortion | N
         values.pop()
     if len(values) not in counts:
         raise ValueError(f"D has {len(coefficients)} numbers, and {model} takes {', '.join(map(str, counts))}")
-    size = 4 if model == _EQUIDISTANT else 12
+    size = 4 if model == EQUIDISTANT else 12
     lens = Distortion(model, (*values, *[0.0] * (size - len(values))))
     if (border := _table(lens)[0][-1]) < _MIN_ANGLE:
         raise ValueError(f"D folds the image back {np.degrees(border):.2g} degrees from the axis")
@@ -185,7 +186,7 @@ def _table(lens: Distortion) -> tuple[np.ndarray, np.ndarray]:
     Beyond, the polynomial folds the image back: two rays would have one position.
     """
     angles = np.linspace(0.0, _MAX_ANGLE, _SAMPLES)
-    if lens.model == _EQUIDISTANT:
+    if lens.model == EQUIDISTANT:
         radii = _distorted_angle(lens, angles)
     else:
         k1, k2, _, _, k3, k4, k5, k6 = lens.coefficients[:8]

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import numbers
 import os
+import warnings
 from typing import Any, Protocol
 
 import numpy as np
@@ -97,11 +98,14 @@ def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
         return camera
     if hasattr(camera, "k") and hasattr(camera, "p"):
         try:
-            return read_camera_info(camera)
+            intrinsics = read_camera_info(camera)
         except MessageError as error:
             raise InputError(str(error)) from None
         except (AttributeError, IndexError, TypeError, ValueError) as error:
             raise InputError(f"camera of type {type(camera).__name__} is no sensor_msgs/CameraInfo: {error}") from None
+        for note in intrinsics.notes:
+            warnings.warn(note.advice, stacklevel=3)  # at the caller of Lifter.lift
+        return intrinsics
     K = _as_floats(camera, "camera")
     if K.shape != (3, 3):
         raise InputError(

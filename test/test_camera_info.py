@@ -178,6 +178,14 @@ def test_the_image_that_is_taken(image, p, d, expected):
     assert bool(camera.uncorrected) == ("distortion_ignored" in expected[3])
 
 
+@pytest.mark.parametrize("image, count", [("auto", 1), ("raw", 1), ("rectified", 0)])
+def test_a_fisheye_without_coefficients_is_no_fisheye_and_noted(image, count):
+    """Rectified images are often published so; an ideal fisheye would be too."""
+    notes = read_camera_info(info(p=PLAIN, d=[0.0] * 4, model="equidistant"), image).notes
+    assert [note.reason for note in notes] == ["image_assumed"] * count
+    assert not read_camera_info(info(p=PLAIN, model="equidistant"), image).notes
+
+
 def test_a_model_that_is_not_known_is_noted_and_not_corrected(opened):
     stream = opened()
     stream.camera_info(info(d=[0.9], model="fov"))
@@ -349,6 +357,9 @@ def test_the_lifter_corrects_the_distortion_of_a_message(model_file):
     for camera in (info(d=BARREL), read_camera_info(info(p=OTHER, d=BARREL), "raw")):
         np.testing.assert_allclose(lifter.lift(raw, camera=camera).root, hips(truth), atol=0.03)
         np.testing.assert_allclose(lifter.lift(raw, camera=camera, layout="coco17").root, hips(truth), atol=0.03)
+    with pytest.warns(UserWarning, match="Set `image` to raw") as warned:
+        lifter.lift(raw, camera=info(p=OTHER, d=BARREL))
+    assert warned[0].filename == __file__
     raw[0, 9] = (CENTRE[0] + 0.8 * FOCAL, CENTRE[1])
     assert not lifter.lift(raw, camera=info(d=[-0.3, 0, 0, 0])).used[0, 9]
 

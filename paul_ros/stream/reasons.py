@@ -209,8 +209,7 @@ _ALL = (
     Reason(
         "image_assumed",
         NOTE,
-        "CameraInfo has distortion and a P that differs from K, so the keypoints are taken as those of the rectified "
-        "image",
+        "CameraInfo leaves open which image the detector sees; the likely one is taken, mostly the rectified one",
         "Set `image` to raw if the detector sees the raw image, or to rectified to confirm.",
     ),
     Reason(
