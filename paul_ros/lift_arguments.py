@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 import os
+import warnings
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,25 +22,34 @@ _FOCAL_LENGTHS = (10.0, 1e6)
 
 HEIGHTS = (0.3, 3.0)
 """Metres, limits of the heights of persons, as of the parameter person_height; centimetres are above them."""
+_LIMITS = "{:g} to {:g}".format(*_FOCAL_LENGTHS)
 
 
 class CameraInfo(Protocol):
-    """A sensor_msgs/CameraInfo of any message library: its size in pixels and its matrices d, k and p."""
+    """A sensor_msgs/CameraInfo of any message library, as far as `read_camera_info` reads it."""
 
     @property
     def width(self) -> Any: ...
     @property
     def height(self) -> Any: ...
     @property
+    def distortion_model(self) -> Any: ...
+    @property
     def d(self) -> Any: ...
     @property
     def k(self) -> Any: ...
     @property
     def p(self) -> Any: ...
+    @property
+    def binning_x(self) -> Any: ...
+    @property
+    def binning_y(self) -> Any: ...
+    @property
+    def roi(self) -> Any: ...
 
 
 Camera = Intrinsics | CameraInfo | ArrayLike
-"""A pinhole camera: intrinsics, a CameraInfo message, or a 3x3 camera matrix K in pixels."""
+"""A camera: intrinsics, a CameraInfo message, or a 3x3 camera matrix K in pixels of a rectified image."""
 
 
 def as_points(points: ArrayLike, visible: ArrayLike | None, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
@@ -78,27 +89,35 @@ def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
     Raises:
         InputError: the camera is none of these, or has implausible values.
     """
-    if camera is None or isinstance(camera, Intrinsics):
+    if camera is None:
+        return None
+    if isinstance(camera, Intrinsics):
+        if not _plausible(camera.fx, camera.fy, camera.cx, camera.cy):
+            raise InputError(
+                f"camera has fx {camera.fx!r}, fy {camera.fy!r}, cx {camera.cx!r}, cy {camera.cy!r}: pass numbers "
+                f"that are finite, and focal lengths of {_LIMITS} pixels"
+            )
         return camera
     if hasattr(camera, "k") and hasattr(camera, "p"):
         try:
-            return read_camera_info(camera)
+            intrinsics = read_camera_info(camera)
         except MessageError as error:
             raise InputError(str(error)) from None
         except (AttributeError, IndexError, TypeError, ValueError) as error:
             raise InputError(f"camera of type {type(camera).__name__} is no sensor_msgs/CameraInfo: {error}") from None
+        for note in intrinsics.notes:
+            warnings.warn(note.text, stacklevel=3)  # at the caller of Lifter.lift
+        return intrinsics
     K = _as_floats(camera, "camera")
     if K.shape != (3, 3):
         raise InputError(
             f"camera has shape {K.shape}: pass Intrinsics, a 3x3 camera matrix K in pixels, or a sensor_msgs/CameraInfo"
         )
     (fx, skew, cx), (zero, fy, cy), last = K.tolist()
-    low, high = _FOCAL_LENGTHS
-    plausible = low <= fx <= high and low <= fy <= high and np.isfinite([cx, cy]).all()
-    if skew or zero or last != [0, 0, 1] or not plausible:
+    if skew or zero or last != [0, 0, 1] or not _plausible(fx, fy, cx, cy):
         raise InputError(
             f"camera {K.tolist()} is no camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with focal lengths from "
-            f"{low:g} to {high:g} pixels: pass the K of the rectified image, not normalised, without skew"
+            f"{_LIMITS} pixels: pass the K of the rectified image, not normalised, without skew"
         )
     return Intrinsics(fx, fy, cx, cy, 0, 0, matrix="K")
 
@@ -121,6 +140,13 @@ def check_height(height: Any) -> None:
     low, high = HEIGHTS
     if not (isinstance(height, numbers.Real) and (height == 0 or low <= float(height) <= high)):
         raise InputError(f"person_height is {height!r}: pass metres, from {low:g} to {high:g}, or 0 if it is unknown")
+
+
+def _plausible(fx: Any, fy: Any, cx: Any, cy: Any) -> bool:
+    """Return whether focal lengths and principal point in pixels are numbers of a camera."""
+    low, high = _FOCAL_LENGTHS
+    are_numbers = all(isinstance(value, numbers.Real) and math.isfinite(value) for value in (fx, fy, cx, cy))
+    return are_numbers and low <= fx <= high and low <= fy <= high
 
 
 def _as_visibility(visible: ArrayLike, points: np.ndarray) -> np.ndarray:

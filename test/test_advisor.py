@@ -55,11 +55,11 @@ def test_keys_are_apart_and_may_be_held(clock, lines):
 
 
 def test_reasons_are_warned_of_when_they_grow(advisor, clock, lines):
-    ledger, reasons = Ledger(), [REASONS["not_2d"], REASONS["distorted_image"]]
+    ledger, reasons = Ledger(), [REASONS["not_2d"], REASONS["image_assumed"]]
     ledger.drop("not_2d", "send 2D", 2)
-    ledger.note("distorted_image", "rectify")
+    ledger.note("image_assumed", "rectify")
     advisor.report_reasons(reasons, ledger)
-    assert lines == ["dropped: not_2d, 2 so far. send 2D", "noted: distorted_image, 1 so far. rectify"]
+    assert lines == ["dropped: not_2d, 2 so far. send 2D", "noted: image_assumed, 1 so far. rectify"]
     clock[0] += REPEAT_SECONDS[0]
     advisor.report_reasons(reasons, ledger)
     ledger.drop("not_2d", "send 2D now")

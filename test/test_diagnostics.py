@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from msg_adapters import Intrinsics
 from paul_ros.ros.diagnostics import ERROR, OK, QUIET_SECONDS, STALE, STALE_SECONDS, WARN, Health, percentiles
 from paul_ros.ros.recent_counts import LASTING, WINDOW
 from paul_ros.stream.reason import NOTE
@@ -20,7 +21,7 @@ S = 10**9  # ns
 @pytest.fixture
 def stream(model_file):
     stream = open_stream(str(model_file))
-    stream.session.intrinsics = SimpleNamespace(matrix="K", distorted=False)
+    stream.session.intrinsics = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
     return stream
 
 
@@ -194,10 +195,10 @@ def test_a_hiccup_that_loses_a_second_of_messages_is_no_warning(health, stream):
 
 
 def test_notes_are_a_warning_as_long_as_they_are_recent(health, stream):
-    assert seconds(health, stream, 0, 1, another_frame=1, stamp_backwards=1, distorted_image=1) == "W"
+    assert seconds(health, stream, 0, 1, another_frame=1, stamp_backwards=1, image_assumed=1) == "W"
     report = health.report(102.0, stream)
     assert report.message.startswith("advice on another_frame; 0 frames")
-    assert [reason.slug for reason in report.warnings] == ["another_frame", "distorted_image", "stamp_backwards"]
+    assert [reason.slug for reason in report.warnings] == ["another_frame", "image_assumed", "stamp_backwards"]
     assert seconds(health, stream, 2, WINDOW)[-2:] == "OO"
 
 

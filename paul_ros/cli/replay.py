@@ -12,6 +12,7 @@ from paul_ros.cli.options import (
     Commands,
     HelpFormatter,
     add_filters,
+    add_image,
     add_json,
     add_model,
     add_output_layout,
@@ -69,6 +70,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_filters(parser)
     add_topics(parser)
+    add_image(parser)
     parser.add_argument(
         "--depth-topic",
         default="/depth",
@@ -104,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
     if args.json != STDOUT:
         require("bags", "rich")
     topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
-    names = ("output_layout", "person_height", "smoothing", "min_confidence", "max_persons")
+    names = ("output_layout", "person_height", "smoothing", "min_confidence", "max_persons", "image")
     parameters = {name: getattr(args, name) for name in names}
     stream = open_stream(args.model, args.layout, **parameters)
     with progress("replay") as count:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_filters, add_model, add_topics, seconds
+from paul_ros.cli.options import Commands, HelpFormatter, add_filters, add_image, add_model, add_topics, seconds
 from paul_ros.cli.output import check_files
 from paul_ros.cli.progress import drawing
 
@@ -58,6 +58,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_filters(parser)
     add_topics(parser)
+    add_image(parser)
     parser.set_defaults(run=run)
 
 
@@ -78,8 +79,8 @@ def run(args: argparse.Namespace) -> None:
     check_files([output], [thing, args.model, args.layout])
     if thing.is_dir() or thing.suffix in (".mcap", ".part"):
         topics = Topics(args.topic, args.camera_info_topic)
-        filters = {"min_confidence": args.min_confidence, "max_persons": args.max_persons}
-        stream = open_stream(args.model, args.layout, **filters)
+        parameters = {name: getattr(args, name) for name in ("min_confidence", "max_persons", "image")}
+        stream = open_stream(args.model, args.layout, **parameters)
         film, damage = view_bag(thing, stream, output, topics, args.start, args.seconds, drawing)
     else:
         film = view_model(load_model(args.thing), output, drawing)

@@ -16,6 +16,7 @@ from paul_ros.offline.figures import new_figure, save_figure
 from paul_ros.offline.judge import MIN_TRUTH_POINTS, match_truth, rigid_frames
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.skeleton_drawing import draw_skeleton
+from paul_ros.stream.messages import image_pixels
 
 _TRUTH_COLOUR = "#c4c4c4"
 _LIFTED_COLOUR, _N_MPJPE_COLOUR, _RIGID_COLOUR = "#2a9d50", "#f0a030", "#9a9a9a"
@@ -98,7 +99,10 @@ class _Row:
 
 
 def _image_row(chosen: Sequence[LiftedFrame]) -> _Row:
-    seen = [np.where(frame.keypoints.visible[..., None], frame.keypoints.xy, np.nan) for frame in chosen]
+    seen = [
+        np.where(frame.keypoints.visible[..., None], image_pixels(frame.keypoints, frame.camera), np.nan)
+        for frame in chosen
+    ]
     return _Row.of("2D input (pixels)", seen, [])
 
 

@@ -27,7 +27,7 @@ from paul_ros.stream.parameters import LIVE
 from paul_ros.stream.person_ids import PersonIds
 from paul_ros.stream.stream import LiftStream, open_stream
 
-_SWITCHING = ("model", "layout", "output_layout")
+_SWITCHING = ("model", "layout", "output_layout", "image")
 """Parameters that need another stream."""
 
 

@@ -18,6 +18,9 @@ NOTE = "note"
 AT_ONCE = 0.0
 """Share that any count exceeds."""
 
+SOME = 0.1
+"""Share above which too many are affected to be chance: lost messages, or points beyond the image's border."""
+
 MOST = 0.5
 """Share above which most are affected. Fewer are normal: persons at the image's edge, or misdetections."""
 

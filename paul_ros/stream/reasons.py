@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from paul_ros.lifted import MAX_DISTANCE
-from paul_ros.stream.reason import AT_ONCE, DROP, MOST, NOTE, PERSON, Reason
+from paul_ros.stream.reason import AT_ONCE, DROP, MOST, NOTE, PERSON, SOME, Reason
 
 _ALL = (
     # --- messages of keypoints that cannot be read
@@ -139,7 +139,7 @@ _ALL = (
         DROP,
         "Messages were lost on the way, or were replaced by newer ones before they could be lifted",
         "Lower the detector's rate, free the CPU, or set the reliability of publisher and subscription to reliable.",
-        warn_above=0.1,
+        warn_above=SOME,
     ),
     Reason(
         "internal_error",
@@ -151,7 +151,7 @@ _ALL = (
     Reason(
         "bad_intrinsics",
         DROP,
-        "CameraInfo has a focal length or principal point that no camera has",
+        "CameraInfo has a focal length, principal point, roi or binning that no camera has",
         "Calibrate the camera, or correct its driver. Until then earlier intrinsics stay in use, or model units.",
     ),
     Reason(
@@ -211,10 +211,44 @@ _ALL = (
         "Report it with the traceback in the log.",
     ),
     Reason(
-        "distorted_image",
+        "image_assumed",
         NOTE,
-        "CameraInfo has distortion but no P, so K is used and positions are slightly wrong",
-        "Let the camera's driver fill P, rectify the image, and detect keypoints in the rectified image.",
+        "CameraInfo leaves open which image the detector sees; the likely one is taken, mostly the rectified one",
+        "Set `image` to raw if the detector sees the raw image, or to rectified to confirm.",
+    ),
+    Reason(
+        "rectified_without_p",
+        NOTE,
+        "`image` is rectified, but P of CameraInfo is not filled, so K is used",
+        "Let the camera's driver fill P, or set `image` to raw.",
+    ),
+    Reason(
+        "distortion_ignored",
+        NOTE,
+        "The image is raw, and the distortion in CameraInfo cannot be used, so it is not corrected",
+        "Calibrate the camera, or let the detector see the rectified image.",
+    ),
+    Reason(
+        "no_ray",
+        NOTE,
+        "A keypoint of the raw image lies where the camera's distortion model has no ray, or 89 degrees or more from "
+        "the optical axis, and is hidden",
+        "If it is counted for most persons, calibrate the camera with images that reach to its borders.",
+    ),
+    Reason(
+        "outside_image",
+        NOTE,
+        "Keypoints lie outside the image that CameraInfo states, as if the image was resized or is another camera's",
+        "Remap `camera_info` to that of the image that the detector sees, with the same size. Send points that the "
+        "detector guesses outside the image with a low confidence.",
+        warn_above=SOME,
+    ),
+    Reason(
+        "corner_of_image",
+        NOTE,
+        "All keypoints so far lie in the upper left quarter of the image that CameraInfo states",
+        "If the detector sees a smaller, resized image, remap `camera_info` to that of the resized image; otherwise no "
+        "action is needed.",
     ),
     Reason(
         "another_frame",
