@@ -88,7 +88,7 @@ def test_other_trouble_is_warned_of_by_its_text(advisor, lines):
 def test_half_an_hour_with_persons_who_come_and_go_is_quiet(advisor, clock, lines, model_file):
     """A new person every 6 s, left out for a second at either edge of the image, with all else as it should be."""
     stream = open_stream(str(model_file))
-    stream.session.intrinsics = SimpleNamespace(matrix="P", distorted=False)
+    stream.session.intrinsics = SimpleNamespace(matrix="P", image="rectified", distortion=None, uncorrected="")
     health = Health(clock[0], stream)
     levels = set()
     for second in range(1800):
