@@ -73,7 +73,7 @@ def test_random_lenses_are_inverted_or_refuse(seed):
 
 
 def test_a_position_beyond_the_fold_has_no_ray():
-    """Of r (1 - 0.3 r^2) the largest value is 0.7027, at r = 1.054."""
+    """The largest value of r (1 - 0.3 r^2) is 0.7027, at r = 1.054."""
     lens = read_distortion("plumb_bob", [-0.3, 0, 0, 0])
     positions = np.array([[0.70, 0], [0, -0.70], [0.71, 0], [0.5, 0.51], [40.0, 3.0], [np.nan, 0]])
     back = lens.undistort(positions)
