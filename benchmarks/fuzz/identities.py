@@ -53,7 +53,7 @@ class _Image:
 
 @dataclass
 class _Oracle:
-    """What is known about ids so far: stamps at which they were shared, and the numbers that stand for them."""
+    """Knowledge of ids so far: stamps at which they were shared, and the numbers that stand for them."""
 
     shared: dict[str, int] = field(default_factory=dict)
     numbers: dict[str, int] = field(default_factory=dict)
