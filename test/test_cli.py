@@ -429,3 +429,15 @@ def test_no_output_overwrites_an_input_or_another_output(words, model_file, tmp_
     assert "another" in capsys.readouterr().err
     assert places["bag"].read_bytes() == ONE.read_bytes() and places["model"].read_bytes() == model_file.read_bytes()
     assert not places["out"].exists()
+
+
+def test_inspect_says_what_is_unknown_in_words():
+    from paul_ros.offline.inspection import as_text
+
+    shown = as_text({"topics": {"/a": {"rate_hz": None}}, "metres_per_unit": None, "derived": {}, "stature": None})
+    assert [line.split(None, 1) for line in shown.splitlines()[2:]] == [
+        ["rate_hz", "unknown: it needs messages of two times"],
+        ["metres_per_unit", "unknown: points are in model units"],
+        ["derived", "none"],
+        ["stature", "none"],
+    ]

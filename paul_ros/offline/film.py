@@ -73,7 +73,8 @@ def view_bag(
         excerpt.copy(bag, part, topics)
         done = replay(part, stream, topics=topics)
     if not any(frame.lifted.ok.any() for frame in done.frames):
-        raise PictureError(f"{bag}: nobody was lifted, so there is nothing to draw; `paul replay` explains why")
+        why = " ".join(done.drop_advice) or "no message shows a person"
+        raise PictureError(f"{bag}: nobody was lifted, so there is nothing to draw: {why}")
     stage = Stage.of(done, bag.stem, excerpt.first)
     shown = _png_frames(done) if out.suffix == ".png" else range(len(done.frames))
     write_film(out, progress((stage.draw(index) for index in shown), len(shown)))
