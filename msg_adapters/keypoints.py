@@ -343,10 +343,15 @@ def record(
 
 
 def _clipped(confidence: np.ndarray) -> tuple[np.ndarray, tuple[Note, ...]]:
-    """Return confidences clipped to 0..1, and a note if some are far outside; -1 marks a point without confidence."""
+    """Return confidences clipped to 0..1, and a note if some are far outside.
+
+    -1 marks a point without confidence. 0, 1 and 2 alone are COCO's flags, where 2 is a visible point.
+    """
     clipped = np.clip(confidence, 0.0, 1.0)
     outside = (np.abs(confidence - clipped) > CONFIDENCE_SLACK) & (confidence != -1)
-    return clipped, (_confidence_note(confidence),) if outside.any() else ()
+    if not outside.any() or np.isin(confidence, (0, 1, 2)).all():
+        return clipped, ()
+    return clipped, (_confidence_note(confidence),)
 
 
 def _confidence_note(confidence: np.ndarray) -> Note:

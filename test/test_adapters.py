@@ -370,7 +370,9 @@ def test_confidences_outside_0_to_1_are_noted(make, confidence):
     assert got.confidence.tolist() == np.clip(np.float32([confidence]), 0, 1).tolist()
 
 
-@pytest.mark.parametrize("confidence", [[0, 0.5, 1, 1.05, 0.9], [-1, -1, 0.5, 0.6, 1], [np.nan, -0.01, 1, 1, 1]])
+@pytest.mark.parametrize(
+    "confidence", [[0, 0.5, 1, 1.05, 0.9], [-1, -1, 0.5, 0.6, 1], [np.nan, -0.01, 1, 1, 1], [0, 1, 2, 2, 0]]
+)
 def test_usual_confidences_are_not_noted(make, confidence):
     columns = {**xy_columns(some_points(1) * 9), "confidence": np.array([confidence])}
     assert read(CLOUD, cloud_of(make, columns), P).notes == ()

@@ -321,7 +321,7 @@ def test_help_fits_a_terminal_and_has_all_parameters():
 
 
 def test_pose_array_of_a_best_effort_publisher(ros, start_lifter, model_file):
-    lifter = start_lifter("-p", f"model:={model_file}")
+    lifter = start_lifter("-p", f"model:={model_file}", "-p", "layout:=coco17")
     bench = Bench(ros, lifter, "geometry_msgs/msg/PoseArray", best_effort=True)
     xyz = np.concatenate([seen(persons_at((0, 0, 4), (1, 0, 4))), np.full((2, 17, 1), 0.9)], axis=-1)
 
