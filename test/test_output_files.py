@@ -155,6 +155,7 @@ def test_links_that_lead_to_no_file(tmp_path):
 def test_a_device_is_written_straight(tmp_path):
     link = tmp_path / "null.json"
     link.symlink_to(os.devnull)
+    assert is_stream(link)  # a fault must not cost root its device
     check_outputs([link, link], [])
     write_json(link, {"frames": 1})
     assert os.readlink(link) == os.devnull and stat.S_ISCHR(os.stat(os.devnull).st_mode)
@@ -164,6 +165,7 @@ def test_a_device_is_written_straight(tmp_path):
 def test_a_full_device_is_named(tmp_path):
     link = tmp_path / "full.json"
     link.symlink_to("/dev/full")
+    assert is_stream(link)
     with pytest.raises(OSError, match="No space left") as refusal:
         write_json(link, {"frames": 1})
     assert refusal.value.filename == str(link) and stat.S_ISCHR(os.stat("/dev/full").st_mode)
