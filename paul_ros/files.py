@@ -9,10 +9,11 @@ import io
 import json
 import os
 import secrets
+import shutil
 import stat
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -133,7 +134,7 @@ def _replacement(path: str | os.PathLike, buffering: int) -> Iterator[BinaryIO]:
                 os.fsync(file.fileno())
         with _naming(path):
             _copy_access(target, part)
-            os.replace(part, target)
+            _replace(target, part)
     except BaseException:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
@@ -149,30 +150,32 @@ def _stream(path: str | os.PathLike, buffering: int) -> Iterator[BinaryIO]:
         # A descriptor is shared and not opened anew, so that what others write to it stays where it is.
         raw = os.open(path, os.O_WRONLY) if descriptor is None else os.dup(descriptor)
     with _naming(path, None):
-        with _Forward(raw) as file:
-            yield file
+        with open(raw, "wb") as file:
+            yield cast(BinaryIO, ForwardOnly(file))
 
 
-class _Forward(io.BufferedWriter):
-    """Writes from front to end: knows its position, counted from where it began, and cannot change it."""
+class ForwardOnly(io.BufferedIOBase):
+    """A file written from front to end: it knows its position, counted from where it began, and cannot change it.
 
-    def __init__(self, descriptor: int) -> None:
-        super().__init__(io.FileIO(descriptor, "wb"))
-        self._written = 0
+    Formats that would look back, as zip does, then write what others can append to or read from a pipe.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._written = file, 0
+
+    def writable(self) -> bool:
+        return True
 
     def write(self, data: Any) -> int:
-        count = super().write(data)
+        count = self._file.write(data)
         self._written += count
         return count
 
+    def flush(self) -> None:
+        self._file.flush()
+
     def tell(self) -> int:
         return self._written
-
-    def seekable(self) -> bool:
-        return False
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        raise io.UnsupportedOperation("a stream is written from front to end")
 
 
 def _descriptor(path: str | os.PathLike) -> int | None:
@@ -205,6 +208,17 @@ def _copy_access(target: Path, part: Path) -> None:
             os.chown(part, before.st_uid, before.st_gid)
         with contextlib.suppress(OSError):
             os.chmod(part, before.st_mode & 0o777)
+
+
+def _replace(target: Path, part: Path) -> None:
+    try:
+        os.replace(part, target)
+    except OSError as error:
+        if error.errno != errno.EBUSY:
+            raise
+        # The target is a mount of its own, as a file that a container shares with its host.
+        shutil.copyfile(part, target)
+        part.unlink()
 
 
 @contextlib.contextmanager

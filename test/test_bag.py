@@ -14,6 +14,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from paul_ros.errors import BagError, OutputError
+from paul_ros.files import is_stream
 from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_writer import BagWriter
@@ -286,6 +287,7 @@ def test_failure_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_a_full_disk_leaves_nothing(tmp_path):
     (tmp_path / "a.mcap").symlink_to("/dev/full")
+    assert is_stream(tmp_path / "a.mcap")
     with pytest.raises(OutputError, match="cannot write .*a.mcap: No space left"):
         write(tmp_path / "a.mcap")
     assert [file.name for file in tmp_path.iterdir()] == ["a.mcap"] and Path("/dev/full").is_char_device()

@@ -16,6 +16,7 @@ import pytest
 from conftest import ROOT
 
 from paul_ros import cli
+from paul_ros.files import is_stream
 from paul_ros.offline.bag_reader import read_records
 from paul_ros.offline.bag_writer import BagWriter
 
@@ -95,7 +96,8 @@ def test_arguments_of_training_are_refused_before_torch_is_imported(tmp_path):
 
 
 def test_a_device_stays_one(tmp_path, short):
-    """As root, too. The device is reached by links only, so that a fault of the program cannot harm it."""
+    """As root, too."""
+    assert is_stream(os.devnull)  # a fault must not cost root its device
     bag, report, plot = links = [tmp_path / name for name in ("o.mcap", "o.json", "o.png")]
     for link in links:
         link.symlink_to(os.devnull)
@@ -137,6 +139,7 @@ def test_dev_stdout_is_standard_output():
     ],
 )
 def test_standard_output_that_takes_nothing(line, code, said):
+    assert is_stream("/dev/full")
     done = shell(line)
     assert (done.returncode, done.stderr.strip()) == (code, said)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import threading
@@ -154,6 +155,7 @@ def test_links_that_lead_to_no_file(tmp_path):
 def test_a_device_is_written_straight(tmp_path):
     link = tmp_path / "null.json"
     link.symlink_to(os.devnull)
+    assert is_stream(link)  # a fault must not cost root its device
     check_outputs([link, link], [])
     write_json(link, {"frames": 1})
     assert os.readlink(link) == os.devnull and stat.S_ISCHR(os.stat(os.devnull).st_mode)
@@ -163,6 +165,7 @@ def test_a_device_is_written_straight(tmp_path):
 def test_a_full_device_is_named(tmp_path):
     link = tmp_path / "full.json"
     link.symlink_to("/dev/full")
+    assert is_stream(link)
     with pytest.raises(OSError, match="No space left") as refusal:
         write_json(link, {"frames": 1})
     assert refusal.value.filename == str(link) and stat.S_ISCHR(os.stat("/dev/full").st_mode)
@@ -255,3 +258,27 @@ def test_a_folder_that_is_removed_meanwhile_is_named(tmp_path):
         part.unlink()
         out.parent.rmdir()
     assert refusal.value.filename == str(out) and names(tmp_path) == []
+
+
+def test_a_file_that_is_a_mount_of_its_own_is_overwritten(tmp_path, monkeypatch):
+    """As a file that a container shares with its host: the system refuses to replace it."""
+    out = tmp_path / "a"
+    out.write_bytes(b"old")
+
+    def busy(part, target):
+        raise OSError(errno.EBUSY, "Device or resource busy", part)
+
+    monkeypatch.setattr(os, "replace", busy)
+    number = out.stat().st_ino
+    write_atomically(out, b"new")
+    assert out.read_bytes() == b"new" and out.stat().st_ino == number and names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("mode", ["wb", "ab"])
+def test_an_archive_goes_behind_what_a_descriptor_holds(tmp_path, mode):
+    """Also where every write goes to the end, as with `>>`."""
+    with open(tmp_path / "log", mode, buffering=0) as log:
+        log.write(b"before ")
+        write_npz(f"/dev/fd/{log.fileno()}", {"a": np.arange(9)})
+    (tmp_path / "a.npz").write_bytes((tmp_path / "log").read_bytes().removeprefix(b"before "))
+    assert read_npz(tmp_path / "a.npz", ["a"])["a"].tolist() == list(range(9))

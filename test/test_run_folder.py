@@ -89,6 +89,15 @@ def test_a_folder_that_stays_empty_is_removed(tmp_path, hold):
     assert not (tmp_path / "c").exists()
 
 
+def test_half_written_files_of_a_killed_training_are_deleted(tmp_path):
+    kept, half = tmp_path / "checkpoint.pt", tmp_path / "seed_1" / "checkpoint.pt.1a2b3c4d.part"
+    half.parent.mkdir()
+    for path in (kept, half):
+        path.touch()
+    with locked(tmp_path):
+        assert kept.exists() and not half.exists()
+
+
 def test_a_file_system_without_locks_is_noted(tmp_path, monkeypatch, capsys):
     def flock(*given):
         raise OSError(errno.ENOLCK, "No locks available")

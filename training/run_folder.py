@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from paul_ros.files import make_folders, remove_if_empty
+from paul_ros.files import PART, make_folders, remove_if_empty
 from training.errors import TrainingError
 from training.recipe import Recipe
 
@@ -35,8 +35,9 @@ def run_folder(folder: Path, recipe: Recipe, seed: int) -> Path:
 def locked(folder: Path) -> Iterator[None]:
     """Keep other trainings out of a folder while the block runs.
 
-    The folder is made if it is missing, and removed if the block leaves it empty. The system's lock of the folder
-    itself is used (flock): there is no lock file, and the lock of a killed process is gone.
+    The folder is made if it is missing, and removed if the block leaves it empty. Half-written files of a killed
+    training are deleted. The system's lock of the folder itself is used (flock): there is no lock file, and the lock of
+    a killed process is gone.
 
     Raises:
         TrainingError: another process has the lock.
@@ -46,6 +47,8 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         descriptor = _locked_descriptor(folder)
         try:
+            for part in folder.rglob(f"*{PART}"):
+                part.unlink(missing_ok=True)
             yield
         finally:
             os.close(descriptor)

@@ -7,7 +7,7 @@ import contextlib
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 STDOUT = Path("-")
 """As the FILE of an option: standard output."""
@@ -85,10 +85,10 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: the file cannot be written; names it.
     """
-    from paul_ros.files import atomic_file
+    from paul_ros.files import ForwardOnly, atomic_file
 
     if path == STDOUT:
-        yield sys.stdout.buffer
+        yield cast(BinaryIO, ForwardOnly(sys.stdout.buffer))
         return
     with atomic_file(path) as file:
         yield file
