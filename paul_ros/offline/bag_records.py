@@ -14,18 +14,27 @@ from paul_ros.errors import BagError
 from paul_ros.extras import require
 
 
+MAX_LOG_TIME = 2**63 - 1
+"""Largest log time in nanoseconds that ROS knows."""
+
+CDR = "cdr"
+"""Serialization of ROS 2 messages."""
+
+
 @dataclass(frozen=True)
 class Record:
     """One serialised message of a bag, with the definition that explains its bytes.
 
     Attributes:
         topic: name of the topic.
-        type_name: ROS type, as 'sensor_msgs/msg/PointCloud2'.
+        type_name: ROS type, as 'sensor_msgs/msg/PointCloud2'; of messages that are not ROS 2's, a name with the
+            serialization in brackets, as 'events (json)'.
         data: CDR with its 4-byte encapsulation header.
         log_time: nanoseconds.
-        definition: text of the type and of all types it contains; '' = the definition of ROS 2 Jazzy.
+        definition: text of the type and of all types it contains; '' = not recorded.
         encoding: language of the definition, 'ros2msg' or 'ros2idl'.
         qos: offered QoS profiles in the YAML of rosbag2; '' = not recorded.
+        type_hash: hash of the definition as of REP-2016, as 'RIHS01_...'; '' = not recorded.
     """
 
     topic: str
@@ -35,6 +44,7 @@ class Record:
     definition: str = ""
     encoding: str = "ros2msg"
     qos: str = ""
+    type_hash: str = ""
 
     def message(self) -> Any:
         """Return the decoded message, a dataclass with the field names of the rclpy message.
@@ -48,6 +58,13 @@ class Record:
             raise
         except Exception as error:  # rosbags raises many kinds for bytes that do not fit their definition
             raise BagError(f"a {self.type_name} message on {self.topic} does not decode: {error}") from error
+
+
+def type_name(name: str, serialization: str) -> str:
+    """Return the name of a type for `Record`; `name` is '' where the recording has none."""
+    if serialization == CDR and name:
+        return name
+    return f"{name or 'message without type'} ({serialization or 'unknown'})"
 
 
 class BagMessages:

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One sqlite3 file of rosbag2 (.db3), read in the order of log time, and read on behind damage.
+
+SQLite stores no checksums: damage inside a message is noticed only if the message does not decode.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from paul_ros.offline.bag_records import CDR, MAX_LOG_TIME, Record, type_name
+from paul_ros.wording import quantity
+
+MAGIC = b"SQLite format 3\0"
+
+_SMALL_STEPS = 1000  # rows that are tried one by one behind damage; then the steps double
+
+
+@dataclass(frozen=True)
+class _Topic:
+    """A row of the table `topics`, with the definition of its type."""
+
+    name: str
+    type_name: str
+    qos: str = ""
+    type_hash: str = ""
+    definition: str = ""
+    encoding: str = "ros2msg"
+
+
+class SqliteFile:
+    """An sqlite3 file; the attributes are those of `McapFile`."""
+
+    storage = "sqlite3"
+    compression = ""
+
+    def __init__(self, path: Path) -> None:
+        """Read the topics and the first and last log time of a file."""
+        self.problems: list[str] = []
+        self.stated: int | None = None
+        self.messages = 0
+        self.span: tuple[int, int] | None = None
+        self._topics: dict[int, _Topic] = {}
+        try:
+            with _connection(path) as database:
+                self._topics = _read_topics(database)
+                self.stated, first, last = database.execute(
+                    "SELECT count(*), min(timestamp), max(timestamp) FROM messages"
+                ).fetchone()
+                self.span = (first, last) if self.stated else None
+        except sqlite3.Error as error:
+            if not self._topics:
+                self.problems.append(f"the database is damaged ({error})")
+                return
+            # The reading notes the damage. Without times, the file comes first.
+            self.span = (0, 0)
+
+    def records(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Record]:
+        """Yield the messages on wanted topics in the order of log time.
+
+        Args:
+            path: of the file, which may have another name than before.
+            wanted: tells whether a topic is read.
+        """
+        if not self._topics:
+            return
+        with _connection(path) as database:
+            last = (-1, -1)
+            try:
+                rows = database.execute("SELECT timestamp, id, topic_id, data FROM messages ORDER BY timestamp, id")
+                for time, row, topic, data in rows:
+                    yield from self._record(time, topic, data, wanted)
+                    last = (time, row)
+            except sqlite3.Error as error:
+                self.problems.append(f"the database is damaged ({error})")
+                yield from self._salvaged(database, last, wanted)
+
+    def _record(self, time: Any, topic: Any, data: Any, wanted: Callable[[str], bool]) -> Iterator[Record]:
+        """Count a message, and yield it if its topic is wanted."""
+        described = self._topics.get(topic)
+        if described is None or not isinstance(data, bytes) or not isinstance(time, int):
+            self.problems.append("a message has no topic or no data")
+            return
+        if not 0 <= time <= MAX_LOG_TIME:
+            self.problems.append(f"a message on {described.name} has no possible log time ({time} ns)")
+            return
+        self.messages += 1
+        if wanted(described.name):
+            yield Record(
+                described.name,
+                described.type_name,
+                data,
+                time,
+                described.definition,
+                described.encoding,
+                described.qos,
+                described.type_hash,
+            )
+
+    def _salvaged(
+        self, database: sqlite3.Connection, last: tuple[int, int], wanted: Callable[[str], bool]
+    ) -> Iterator[Record]:
+        """Yield the messages behind the last one that was read, as far as they are whole."""
+        lost = 0
+        for time, row in sorted(found for found in _whole_rows(database) if found > last):
+            try:
+                topic, data = database.execute("SELECT topic_id, data FROM messages WHERE id = ?", (row,)).fetchone()
+            except (sqlite3.Error, TypeError):
+                lost += 1
+            else:
+                yield from self._record(time, topic, data, wanted)
+        if lost:
+            self.problems.append(f"{quantity(lost, 'message')} cannot be read")
+
+
+@contextlib.contextmanager
+def _connection(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database without writing anything beside it.
+
+    A write-ahead log beside the file holds the last messages of a recorder that was killed, or still records. Reading it
+    needs a folder that can be written to.
+    """
+    log = path.with_name(path.name + "-wal")
+    mode = "mode=ro" if log.exists() and log.stat().st_size else "immutable=1"
+    database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
+    try:
+        # Otherwise SQLite refuses a whole file that was cut. Nothing is written in this mode.
+        database.execute("PRAGMA writable_schema = ON")
+        yield database
+    finally:
+        database.close()
+
+
+def _read_topics(database: sqlite3.Connection) -> dict[int, _Topic]:
+    """Return topics by their numbers. Recordings before ROS 2 Iron hold no definitions."""
+    definitions: dict[str, tuple[str, str]] = {}
+    with contextlib.suppress(sqlite3.Error):
+        for row in _rows(database, "message_definitions"):
+            definitions[row["topic_type"]] = (row["encoded_message_definition"], row["encoding"])
+    topics = {}
+    for row in _rows(database, "topics"):
+        definition, encoding = definitions.get(row["type"], ("", "ros2msg"))
+        topics[row["id"]] = _Topic(
+            row["name"],
+            type_name(row["type"], row.get("serialization_format", CDR)),
+            row.get("offered_qos_profiles", ""),
+            row.get("type_description_hash", ""),
+            definition,
+            encoding if definition else "ros2msg",
+        )
+    return topics
+
+
+def _rows(database: sqlite3.Connection, table: str) -> list[dict[str, Any]]:
+    cursor = database.execute(f"SELECT * FROM {table}")
+    names = [column[0] for column in cursor.description]
+    return [dict(zip(names, row)) for row in cursor]
+
+
+def _whole_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int]]:
+    """Yield (log time, number) of the rows that can be read, stepping over damaged pages."""
+    row, failures = -1, 0
+    while row < MAX_LOG_TIME:
+        try:
+            for number, time in database.execute(
+                "SELECT id, timestamp FROM messages NOT INDEXED WHERE id > ? ORDER BY id", (row,)
+            ):
+                row, failures = number, 0
+                yield time, number
+            return
+        except sqlite3.Error:
+            failures += 1
+            row += 1 << max(0, failures - _SMALL_STEPS)
