@@ -29,15 +29,21 @@ class Storage(Protocol):
     storage: str
     compression: str
     problems: list[str]
-    stated: int | None
     messages: int
+
+    @property
+    def stated(self) -> int | None:
+        """Number of messages by the file's own statistics; None = unknown."""
 
     @property
     def span(self) -> tuple[int, int] | None:
         """First and last log time in nanoseconds; None without messages."""
 
+    def topics(self) -> dict[str, tuple[str, int]] | None:
+        """Return {topic: (type name, number of messages)} as far as the file tells without being read."""
+
     def records(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Record]:
-        """Yield the messages on wanted topics in the order of log time."""
+        """Yield the messages on wanted topics by `Record.order`."""
 
 
 class BagFile:
@@ -79,7 +85,9 @@ class BagFile:
             self.refusal = "the file is empty (0 bytes); the recording never began"
         elif head.startswith(_ROS1_MAGIC):
             name = self.path.stem
-            self.refusal = f"a ROS 1 bag; convert it with `rosbags-convert --src {self.path} --dst {name} --dst-storage mcap`"
+            self.refusal = (
+                f"a ROS 1 bag; convert it with `rosbags-convert --src {self.path} --dst {name} --dst-storage mcap`"
+            )
         elif self._pack_damage:
             self.refusal = f"the compressed file is damaged ({self._pack_damage})"
         else:
@@ -105,8 +113,18 @@ class BagFile:
         """What is damaged, a clause each, as far as the file was read."""
         return self._storage.problems if self._storage else []
 
+    def topics(self) -> dict[str, tuple[str, int]]:
+        """Return {topic: (type name, number of whole messages)}; a file that does not tell is read whole."""
+        known = self._storage.topics() if self._storage else {}
+        if known is not None:
+            return known
+        found: dict[str, tuple[str, int]] = {}
+        for record in self.records(lambda topic: True):
+            found[record.topic] = (record.type_name, found.get(record.topic, ("", 0))[1] + 1)
+        return found
+
     def records(self, wanted: Callable[[str], bool]) -> Iterator[Record]:
-        """Yield the messages on wanted topics in the order of log time."""
+        """Yield the messages on wanted topics by `Record.order`."""
         if not self._storage:
             return
         try:

@@ -7,8 +7,8 @@ where nothing behind it can be read. After all whole messages comes one BagError
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -75,16 +75,20 @@ class Recording:
 
     def records(self, topics: Iterable[str] | None = None) -> Iterator[Record]:
         """Yield the messages on some topics, as `read_records` does; raises the same BagError."""
+        yield from self.whole_records(topics)
+        if damage := self.damage:
+            raise damage
+
+    def whole_records(self, topics: Iterable[str] | None = None) -> Iterator[Record]:
+        """Yield the messages on some topics, as `read_records` does. Afterwards, `damage` tells what was lost."""
         names = None if topics is None else frozenset(topics)
 
         def wanted(topic: str) -> bool:
             return names is None or any(matches(topic, name) for name in names)
 
         yield from merge_by_time(
-            (file.span[0] if file.span else 0, lambda file=file: file.records(wanted)) for file in self.files
+            (file.span[0] if file.span else 0, functools.partial(file.records, wanted)) for file in self.files
         )
-        if damage := self.damage:
-            raise damage
 
     @property
     def damage(self) -> BagError | None:
@@ -129,7 +133,7 @@ def read_records(path: str | Path, topics: Iterable[str] | None = None) -> Itera
     yield from Recording(path).records(topics)
 
 
-@lru_cache(maxsize=1024)
+@functools.lru_cache(maxsize=1024)
 def matches(topic: str, name: str) -> bool:
     """Return whether a topic has a name; * in the name stands for any one part between slashes."""
     parts, wanted = topic.split("/"), name.split("/")
@@ -138,13 +142,13 @@ def matches(topic: str, name: str) -> bool:
 
 def topics_of(path: str | Path) -> dict[str, tuple[str, int]]:
     """Return {topic: (type name, number of whole messages)} of a recording; raises BagError if there is none."""
+    recording = Recording(path)
     found: dict[str, tuple[str, int]] = {}
-    try:
-        for record in read_records(path):
-            found[record.topic] = (record.type_name, found.get(record.topic, ("", 0))[1] + 1)
-    except BagError:
-        if not found:
-            raise
+    for file in recording.files:
+        for topic, (kind, count) in file.topics().items():
+            found[topic] = (kind, count + found.get(topic, ("", 0))[1])
+    if not found and recording.damage:
+        raise recording.damage
     return found
 
 
@@ -192,8 +196,8 @@ def _not_one(folder: Path, files: list[Path]) -> str:
     named = " or ".join(f"`paul replay {_quoted(file)}`" for file in files[:_NAMED_FILES])
     more = f" and {len(files) - _NAMED_FILES} more" if len(files) > _NAMED_FILES else ""
     return (
-        f"{folder}: holds {quantity(len(files), 'recording')}, not the files of one; give them one by one, as in {named}"
-        f"{more}; `paul train` takes several at once"
+        f"{folder}: holds {quantity(len(files), 'recording')}, not the files of one. Give them one by one, as in "
+        f"{named}{more}; `paul train` takes several at once"
     )
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One mcap file, read in the order of log time, and read on behind damage.
 
-A first walk finds the blocks of the file. Each is loaded when the reading reaches its first log time, so the memory does
-not grow with the file. `mcap` decompresses the chunks and parses their descriptions; it comes with the extra `bags`.
+A first walk finds the blocks of the file. Each is loaded when the reading reaches its first log time, so the memory
+does not grow with the file. `mcap` decompresses the chunks and parses descriptions; it comes with the extra `bags`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ class McapFile:
         storage: name of the storage, as in metadata.yaml.
         compression: of the chunks, such as 'zstd'; '' = none, or not known before the file is read.
         problems: what is damaged, a clause each; grows while the file is read.
-        stated: number of messages by the file's own statistics; None = unknown.
         messages: number of messages read, of all topics.
     """
 
@@ -42,7 +41,7 @@ class McapFile:
             frames = Frames(stream)
         self.compression = ""
         self.problems = frames.problems
-        self.stated = frames.stated
+        self._statistics = frames.statistics
         self.messages = 0
         self._blocks = frames.blocks
         self._schemas: dict[int, Schema] = {}
@@ -52,11 +51,29 @@ class McapFile:
             self._describe(opcode, content)
 
     @property
+    def stated(self) -> int | None:
+        """Number of messages by the file's own statistics; None = unknown."""
+        return self._statistics.message_count if self._statistics else None
+
+    @property
     def span(self) -> tuple[int, int] | None:
         """First and last log time in nanoseconds; None without messages."""
         if not self._blocks:
             return None
         return min(block.first for block in self._blocks), max(block.last for block in self._blocks)
+
+    def topics(self) -> dict[str, tuple[str, int]] | None:
+        """Return {topic: (type name, number of messages)} by the file's own statistics; None = unknown."""
+        if not self._statistics or self.problems:
+            return None
+        found: dict[str, tuple[str, int]] = {}
+        for number, count in self._statistics.channel_message_counts.items():
+            channel = self._channels.get(number)
+            if channel is None:
+                return None
+            if count:
+                found[channel.topic] = (self._type_name(channel), count + found.get(channel.topic, ("", 0))[1])
+        return found
 
     def records(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Record]:
         """Yield the messages on wanted topics in the order of log time.
@@ -73,7 +90,7 @@ class McapFile:
 
     def _block_records(self, stream: BinaryIO, block: Block, wanted: Callable[[str], bool]) -> Iterator[Record]:
         found = self._load(stream, block, wanted)
-        found.sort(key=lambda record: record.log_time)  # stable: equal times keep the order of the file
+        found.sort(key=lambda record: record.order)  # stable: equal ones keep the order of the file
         found.reverse()
         while found:
             yield found.pop()  # so that a block with one late message does not keep the others
@@ -133,7 +150,7 @@ class McapFile:
         schema = self._schemas.get(channel.schema_id)
         return Record(
             channel.topic,
-            type_name(schema.name if schema else "", channel.message_encoding),
+            self._type_name(channel),
             bytes(data[start + MESSAGE_HEAD.size : end]),
             log_time,
             schema.data.decode(errors="replace") if schema else "",
@@ -141,6 +158,10 @@ class McapFile:
             channel.metadata.get("offered_qos_profiles", ""),
             channel.metadata.get("topic_type_hash", ""),
         )
+
+    def _type_name(self, channel: Channel) -> str:
+        schema = self._schemas.get(channel.schema_id)
+        return type_name(schema.name if schema else "", channel.message_encoding)
 
     def _search_channel(self, number: int, stream: BinaryIO) -> Channel | None:
         """Read the descriptions in all chunks: a killed recorder leaves no summary that repeats them."""

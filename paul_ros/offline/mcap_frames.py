@@ -11,7 +11,11 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO
+from io import BytesIO
+from typing import TYPE_CHECKING, BinaryIO
+
+if TYPE_CHECKING:
+    from mcap.records import Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -27,7 +31,6 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")  # first and last log time, size, checksum
 _DATA_END_CONTENT = struct.Struct("<I")  # checksum
 _FOOTER_CONTENT = struct.Struct("<QQI")  # start of the summary, start of its offsets, checksum
-_STATISTICS_HEAD = struct.Struct("<Q")  # number of messages
 _CHECKSUM_BYTES = 4
 _LAST_OPCODE, _FIRST_PRIVATE_OPCODE = 0x0F, 0x80
 
@@ -64,7 +67,7 @@ class Frames:
     Attributes:
         blocks: chunks, and runs of messages outside chunks, in the order of the file.
         descriptions: (opcode, content) of schemas and channels outside chunks.
-        stated: number of messages by the file's own statistics; None = unknown.
+        statistics: counts of messages in the summary; None = there are none.
         problems: what is damaged, a clause each.
     """
 
@@ -72,7 +75,7 @@ class Frames:
         """Walk through a file whose start is known to be MAGIC; raises OSError."""
         self.blocks: list[Block] = []
         self.descriptions: list[tuple[int, bytes]] = []
-        self.stated: int | None = None
+        self.statistics: Statistics | None = None
         self.problems: list[str] = []
         self._stream = stream
         self._size = stream.seek(0, 2)
@@ -201,19 +204,21 @@ class Frames:
     def _walk_summary(self, start: int) -> None:
         """Read descriptions and statistics behind the data section, and check the end of the file."""
         descriptions: list[tuple[int, bytes]] = []
-        stated, at = None, start
+        statistics, at = b"", start
         while True:
             frame = self._frame(at)
             if frame is None:
                 self.problems.append(f"the index is damaged: {self._what_is_wrong(at)}")
                 return
             opcode, end = frame
-            content = self._stream.read(end - at - FRAME.size) if opcode in (SCHEMA, CHANNEL, STATISTICS, FOOTER) else b""
+            content = (
+                self._stream.read(end - at - FRAME.size) if opcode in (SCHEMA, CHANNEL, STATISTICS, FOOTER) else b""
+            )
             at = end
             if opcode in (SCHEMA, CHANNEL):
                 descriptions.append((opcode, content))
-            elif opcode == STATISTICS and len(content) >= _STATISTICS_HEAD.size:
-                (stated,) = _STATISTICS_HEAD.unpack_from(content)
+            elif opcode == STATISTICS:
+                statistics = content
             elif opcode == FOOTER:
                 break
         if len(content) < _FOOTER_CONTENT.size:
@@ -224,7 +229,7 @@ class Frames:
         if checksum not in (0, self._checksum(start, at - _CHECKSUM_BYTES)):
             self.problems.append("the checksum of the index is wrong")
             return
-        self.stated = stated
+        self.statistics = _parsed(statistics) if statistics else None
         self.descriptions += descriptions
         self._check_end(at)
 
@@ -235,3 +240,13 @@ class Frames:
             self.problems.append("the end mark is damaged" if len(mark) == len(MAGIC) else "the file ends too early")
         elif at + len(MAGIC) != self._size:
             self.problems.append("the file goes on after the end mark")
+
+
+def _parsed(content: bytes) -> Statistics | None:
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Statistics
+
+    try:
+        return Statistics.read(ReadDataStream(BytesIO(content)))
+    except Exception:  # the checksum is right, so another version of the format wrote it
+        return None

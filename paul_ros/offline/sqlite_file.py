@@ -7,6 +7,8 @@ SQLite stores no checksums: damage inside a message is noticed only if the messa
 from __future__ import annotations
 
 import contextlib
+import itertools
+import operator
 import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -47,6 +49,7 @@ class SqliteFile:
         self.messages = 0
         self.span: tuple[int, int] | None = None
         self._topics: dict[int, _Topic] = {}
+        self._counts: dict[str, tuple[str, int]] = {}
         try:
             with _connection(path) as database:
                 self._topics = _read_topics(database)
@@ -54,20 +57,32 @@ class SqliteFile:
                     "SELECT count(*), min(timestamp), max(timestamp) FROM messages"
                 ).fetchone()
                 self.span = (first, last) if self.stated else None
-        except sqlite3.Error as error:
+                for number, count in database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"):
+                    topic = self._topics[number]
+                    self._counts[topic.name] = (topic.type_name, count)
+        except (sqlite3.Error, KeyError) as error:
             if not self._topics:
                 self.problems.append(f"the database is damaged ({error})")
-                return
-            # The reading notes the damage. Without times, the file comes first.
-            self.span = (0, 0)
+            # The reading notes other damage. Without times, the file comes first.
+            self.stated, self.span, self._counts = None, (0, 0) if self._topics else None, {}
+
+    def topics(self) -> dict[str, tuple[str, int]] | None:
+        """Return {topic: (type name, number of messages)}; None = unknown, as the database is damaged."""
+        if self.problems or not self.stated:
+            return None
+        return self._counts
 
     def records(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Record]:
-        """Yield the messages on wanted topics in the order of log time.
+        """Yield the messages on wanted topics by `Record.order`.
 
         Args:
             path: of the file, which may have another name than before.
             wanted: tells whether a topic is read.
         """
+        for _, tied in itertools.groupby(self._by_time(path, wanted), key=operator.attrgetter("log_time")):
+            yield from sorted(tied, key=operator.attrgetter("order"))
+
+    def _by_time(self, path: Path, wanted: Callable[[str], bool]) -> Iterator[Record]:
         if not self._topics:
             return
         with _connection(path) as database:
@@ -123,8 +138,8 @@ class SqliteFile:
 def _connection(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a database without writing anything beside it.
 
-    A write-ahead log beside the file holds the last messages of a recorder that was killed, or still records. Reading it
-    needs a folder that can be written to.
+    A write-ahead log beside the file holds the last messages of a recorder that was killed, or still records. SQLite
+    reads it only in a folder that can be written to.
     """
     log = path.with_name(path.name + "-wal")
     mode = "mode=ro" if log.exists() and log.stat().st_size else "immutable=1"

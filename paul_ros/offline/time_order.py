@@ -9,23 +9,23 @@ from collections.abc import Callable, Iterable, Iterator
 from paul_ros.offline.bag_records import Record
 
 Source = tuple[int, Callable[[], Iterator[Record]]]
-"""First log time of some messages, and a function that opens them, sorted by log time."""
+"""First log time of some messages, and a function that opens them, sorted by `Record.order`."""
 
 
 def merge_by_time(sources: Iterable[Source]) -> Iterator[Record]:
-    """Yield the messages of all sources in the order of log time.
+    """Yield the messages of all sources by `Record.order`.
 
-    A source is opened when the merge reaches its first log time. Messages of equal times keep the order of the sources.
+    A source is opened when the merge reaches its first log time. Messages of equal order keep that of the sources.
     """
     waiting = sorted(((first, number, open_) for number, (first, open_) in enumerate(sources)), reverse=True)
-    opened: list[tuple[int, int, Record, Iterator[Record]]] = []
+    opened: list[tuple[tuple[int, int], int, Record, Iterator[Record]]] = []
     while waiting or opened:
-        if waiting and (not opened or waiting[-1][0] <= opened[0][0]):
+        if waiting and (not opened or waiting[-1][0] <= opened[0][2].log_time):
             _, number, open_ = waiting.pop()
             messages = open_()
             record = next(messages, None)
             if record is not None:
-                heapq.heappush(opened, (record.log_time, number, record, messages))
+                heapq.heappush(opened, (record.order, number, record, messages))
             continue
         _, number, record, messages = opened[0]
         yield record
@@ -33,4 +33,4 @@ def merge_by_time(sources: Iterable[Source]) -> Iterator[Record]:
         if following is None:
             heapq.heappop(opened)
         else:
-            heapq.heapreplace(opened, (following.log_time, number, following, messages))
+            heapq.heapreplace(opened, (following.order, number, following, messages))
