@@ -17,7 +17,7 @@ from training.data import RawFrames
 from training.errors import DataError
 
 if TYPE_CHECKING:
-    from paul_ros.offline.bag_reader import Recording, matches
+    from paul_ros.offline.bag_reader import Recording
 
 
 def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: float) -> RawFrames:
@@ -29,7 +29,7 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
         DataError: it has no keypoints of the layout, or several topics or cameras.
     """
     require("train", "mcap", "rosbags")
-    from paul_ros.offline.bag_reader import Recording
+    from paul_ros.offline.bag_reader import Recording, matches
 
     camera, image_size, rejections = _bag_camera(path)
     recording = Recording(path)

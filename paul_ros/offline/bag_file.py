@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import shutil
 import stat
 import tempfile
 from collections import Counter
@@ -81,15 +82,15 @@ class BagFile:
             self._storage = McapFile(plain)
         elif head.startswith(sqlite_file.MAGIC):
             self._storage = SqliteFile(plain)
-        elif not head and not self._pack_damage:
+        elif not head and not self._packed:
             self.refusal = "the file is empty (0 bytes); the recording never began"
         elif head.startswith(_ROS1_MAGIC):
             name = self.path.stem
             self.refusal = (
                 f"a ROS 1 bag; convert it with `rosbags-convert --src {self.path} --dst {name} --dst-storage mcap`"
             )
-        elif self._pack_damage:
-            self.refusal = f"the compressed file is damaged ({self._pack_damage})"
+        elif self._packed and (self._pack_damage or not head):
+            self.refusal = f"the compressed file is damaged ({self._pack_damage or 'it ends too early'})"
         else:
             self.refusal = f"not an mcap or sqlite3 file; {conversion(self.path)}"
 
@@ -165,8 +166,9 @@ class BagFile:
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / self.path.stem
             with open(self.path, "rb") as packed, open(plain, "wb") as target:
+                unpacked = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
                 try:
-                    zstandard.ZstdDecompressor().copy_stream(packed, target)
+                    shutil.copyfileobj(unpacked, target)
                 except zstandard.ZstdError as error:
                     self._pack_damage = str(error)
             yield plain
@@ -187,8 +189,8 @@ class BagFile:
         """How many messages were read, and how many the file states to hold, in words."""
         stated = self._storage.stated if self._storage else None
         if stated is None:
-            return f"{quantity(self.messages, 'whole message')}"
-        return f"all {stated} messages" if self.messages == stated else f"{self.messages} of {stated} messages"
+            return quantity(self.messages, "whole message")
+        return f"All {stated} messages" if self.messages == stated else f"{self.messages} of {stated} messages"
 
 
 def conversion(path: Path) -> str:

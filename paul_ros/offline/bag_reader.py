@@ -99,12 +99,13 @@ class Recording:
         messages = sum(file.messages for file in self.files)
         if len(self.files) == 1 and not self.missing:
             return BagError(_damage_of_file(self.files[0]), messages)
-        told = [f"{file.path.name}: {file.damage}, {file.whole_messages} read" for file in bad]
+        told = [f"{file.path.name}: {file.damage} ({file.whole_messages} read)" for file in bad]
         told += [f"{file.name}: missing" for file in self.missing]
         more = f"; and {len(told) - _NAMED_FILES} more" if len(told) > _NAMED_FILES else ""
+        verb = "is" if len(told) == 1 else "are"
         return BagError(
-            f"{self.path}: {quantity(len(told), 'file')} of {len(self.files) + len(self.missing)} damaged or missing: "
-            f"{'; '.join(told[:_NAMED_FILES])}{more}. All {quantity(messages, 'whole message')} were read",
+            f"{self.path}: {len(told)} of {len(self.files) + len(self.missing)} files {verb} damaged or missing: "
+            f"{'; '.join(told[:_NAMED_FILES])}{more}. {quantity(messages, 'whole message')} were read in all",
             messages,
         )
 
@@ -156,7 +157,7 @@ def _damage_of_file(file: BagFile) -> str:
     if file.refusal:
         return f"{file.path}: {file.refusal}"
     advice = f", or try `mcap recover {file.path.name}`" if file.storage == "mcap" else ""
-    return f"{file.path}: damaged: {file.damage}; {file.whole_messages} were read. Record it again{advice}"
+    return f"{file.path}: damaged: {file.damage}. {file.whole_messages} were read. Record it again{advice}"
 
 
 def _in_order_of_time(files: list[BagFile]) -> list[BagFile]:

@@ -136,7 +136,7 @@ def _file_text(file: dict) -> str:
     times = "no times" if file["start_s"] is None else f"{file['start_s']:.1f} to {file['end_s']:.1f} s"
     told = [times, quantity(file["messages"], "message"), file["storage"] or "unknown storage", file["compression"]]
     if file["damage"]:
-        told.append(f"damaged: {file['damage']}")
+        told.append("damaged")
     return ", ".join(filter(None, told))
 
 

@@ -42,7 +42,7 @@ _POSSIBLE_FRAME = re.compile(rb"[\x03-\x07\x0f]....\x00\x00\x00\x00", re.DOTALL)
 _PROOF = 3  # whole records in a row that prove the first of them
 
 
-@dataclass
+@dataclass(slots=True)
 class Block:
     """Bytes of a file that are loaded together: a chunk, or a run of messages outside chunks.
 

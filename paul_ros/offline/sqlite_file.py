@@ -187,7 +187,8 @@ def _whole_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int]]:
                 "SELECT id, timestamp FROM messages NOT INDEXED WHERE id > ? ORDER BY id", (row,)
             ):
                 row, failures = number, 0
-                yield time, number
+                if isinstance(time, int):  # a damaged row has empty columns
+                    yield time, number
             return
         except sqlite3.Error:
             failures += 1
