@@ -25,7 +25,7 @@ _NAMED_PROBLEMS = 3  # most kinds of damage that a text names
 
 
 class Storage(Protocol):
-    """What a storage tells of a file; see `McapFile`."""
+    """Interface of a storage; `McapFile` explains it."""
 
     storage: str
     compression: str
@@ -111,7 +111,7 @@ class BagFile:
 
     @property
     def problems(self) -> list[str]:
-        """What is damaged, a clause each, as far as the file was read."""
+        """Damage in words, a clause each, as far as the file was read."""
         return self._storage.problems if self._storage else []
 
     def topics(self) -> dict[str, tuple[str, int]]:
@@ -175,7 +175,7 @@ class BagFile:
 
     @property
     def damage(self) -> str:
-        """What is wrong with the file, in a few words; '' = nothing, as far as it was read."""
+        """Damage of the file in a few words, as far as it was read; '' = none."""
         if self.refusal:
             return self.refusal
         counts = Counter(self.problems)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which files make one recording: those in metadata.yaml, or the numbered splits of a folder."""
+"""The files of one recording: those in metadata.yaml, or the numbered splits of a folder."""
 
 from __future__ import annotations
 

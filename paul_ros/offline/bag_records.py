@@ -122,6 +122,10 @@ class BagMessages:
         """Return a message as little-endian CDR."""
         return bytes(self._store.serialize_cdr(message, message.__msgtype__, little_endian=True))
 
+    def known_definition(self, type_name: str) -> str:
+        """Return the same as `definition`, or '' for a type that this factory does not know."""
+        return self.definition(type_name) if type_name in self._store.types else ""
+
     def definition(self, type_name: str) -> str:
         """Return the ros2msg text of a type and of all types it contains."""
         return self._store.generate_msgdef(type_name, ros_version=2)[0]

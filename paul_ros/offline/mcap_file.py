@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """One mcap file, read in the order of log time, and read on behind damage.
 
-A first walk finds the blocks of the file. Each is loaded when the reading reaches its first log time, so the memory
-does not grow with the file. `mcap` decompresses the chunks and parses descriptions; it comes with the extra `bags`.
+A first walk finds the blocks of the file. Each is loaded when the reading reaches its first log time. So the memory
+does not grow with the file.
+
+The package `mcap` decompresses the chunks and parses descriptions. It comes with the extra `bags`.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ class McapFile:
     Attributes:
         storage: name of the storage, as in metadata.yaml.
         compression: of the chunks, such as 'zstd'; '' = none, or not known before the file is read.
-        problems: what is damaged, a clause each; grows while the file is read.
+        problems: damage in words, a clause each; grows while the file is read.
         messages: number of messages read, of all topics.
     """
 
@@ -87,10 +89,14 @@ class McapFile:
             yield from merge_by_time(
                 (block.first, functools.partial(self._block_records, stream, block, wanted)) for block in self._blocks
             )
+        if self.stated is not None and self.messages < self.stated and not self.problems:
+            self.problems.append("the file states more messages than it holds")
 
     def _block_records(self, stream: BinaryIO, block: Block, wanted: Callable[[str], bool]) -> Iterator[Record]:
         found = self._load(stream, block, wanted)
         found.sort(key=lambda record: record.order)  # stable: equal ones keep the order of the file
+        if found and found[0].log_time < block.first:
+            self.problems.append("the times of a chunk are wrong, so messages come late")
         found.reverse()
         while found:
             yield found.pop()  # so that a block with one late message does not keep the others

@@ -37,7 +37,7 @@ _LAST_OPCODE, _FIRST_PRIVATE_OPCODE = 0x0F, 0x80
 _RUN_BYTES = 256 * 1024  # of messages outside chunks that are loaded at once
 _PIECE_BYTES = 1 << 20  # read at once
 
-#: What may be the frame of a record that a search is content with: its length is below 4 GiB.
+#: A search takes such bytes for a possible frame: its length is below 4 GiB.
 _POSSIBLE_FRAME = re.compile(rb"[\x03-\x07\x0f]....\x00\x00\x00\x00", re.DOTALL)
 _PROOF = 3  # whole records in a row that prove the first of them
 
@@ -68,7 +68,7 @@ class Frames:
         blocks: chunks, and runs of messages outside chunks, in the order of the file.
         descriptions: (opcode, content) of schemas and channels outside chunks.
         statistics: counts of messages in the summary; None = there are none.
-        problems: what is damaged, a clause each.
+        problems: damage in words, a clause each.
     """
 
     def __init__(self, stream: BinaryIO) -> None:

@@ -21,6 +21,8 @@ from paul_ros.wording import quantity
 
 MAGIC = b"SQLite format 3\0"
 
+_ERRORS = (sqlite3.Error, UnicodeError)  # SQLite's own error text can hold damaged bytes
+
 _SMALL_STEPS = 1000  # rows that are tried one by one behind damage; then the steps double
 
 
@@ -60,7 +62,7 @@ class SqliteFile:
                 for number, count in database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"):
                     topic = self._topics[number]
                     self._counts[topic.name] = (topic.type_name, count)
-        except (sqlite3.Error, KeyError) as error:
+        except (*_ERRORS, KeyError) as error:
             if not self._topics:
                 self.problems.append(f"the database is damaged ({error})")
             # The reading notes other damage. Without times, the file comes first.
@@ -86,13 +88,15 @@ class SqliteFile:
         if not self._topics:
             return
         with _connection(path) as database:
-            last = (-1, -1)
+            last = (-(2**63), -1)
             try:
                 rows = database.execute("SELECT timestamp, id, topic_id, data FROM messages ORDER BY timestamp, id")
                 for time, row, topic, data in rows:
+                    if not _is_after((time, row), last):
+                        raise sqlite3.DatabaseError("its index is out of order")
                     yield from self._record(time, topic, data, wanted)
                     last = (time, row)
-            except sqlite3.Error as error:
+            except _ERRORS as error:
                 self.problems.append(f"the database is damaged ({error})")
                 yield from self._salvaged(database, last, wanted)
 
@@ -126,7 +130,7 @@ class SqliteFile:
         for time, row in sorted(found for found in _whole_rows(database) if found > last):
             try:
                 topic, data = database.execute("SELECT topic_id, data FROM messages WHERE id = ?", (row,)).fetchone()
-            except (sqlite3.Error, TypeError):
+            except (*_ERRORS, TypeError):
                 lost += 1
             else:
                 yield from self._record(time, topic, data, wanted)
@@ -146,6 +150,7 @@ def _connection(path: Path) -> Iterator[sqlite3.Connection]:
     database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
     try:
         # Otherwise SQLite refuses a whole file that was cut. Nothing is written in this mode.
+        database.text_factory = lambda data: data.decode(errors="replace")
         database.execute("PRAGMA writable_schema = ON")
         yield database
     finally:
@@ -155,7 +160,7 @@ def _connection(path: Path) -> Iterator[sqlite3.Connection]:
 def _read_topics(database: sqlite3.Connection) -> dict[int, _Topic]:
     """Return topics by their numbers. Recordings before ROS 2 Iron hold no definitions."""
     definitions: dict[str, tuple[str, str]] = {}
-    with contextlib.suppress(sqlite3.Error):
+    with contextlib.suppress(*_ERRORS):
         for row in _rows(database, "message_definitions"):
             definitions[row["topic_type"]] = (row["encoded_message_definition"], row["encoding"])
     topics = {}
@@ -186,10 +191,17 @@ def _whole_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int]]:
             for number, time in database.execute(
                 "SELECT id, timestamp FROM messages NOT INDEXED WHERE id > ? ORDER BY id", (row,)
             ):
+                if not _is_after((0, number), (0, row)):
+                    raise sqlite3.DatabaseError("its rows are out of order")
                 row, failures = number, 0
                 if isinstance(time, int):  # a damaged row has empty columns
                     yield time, number
             return
-        except sqlite3.Error:
+        except _ERRORS:
             failures += 1
             row += 1 << max(0, failures - _SMALL_STEPS)
+
+
+def _is_after(place: tuple[Any, Any], last: tuple[int, int]) -> bool:
+    """Return whether (log time, number) follows another; damaged pages can lead in circles."""
+    return all(isinstance(value, int) for value in place) and place > last
