@@ -14,7 +14,7 @@ import foreign_messages as foreign
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -185,6 +185,17 @@ def test_missing_files_are_named(tmp_path):
     assert numbers(tmp_path / "rec") == (list(range(40, 80)), None)
 
 
+def test_files_that_metadata_lacks_belong_by_name_and_time(tmp_path):
+    files = splits(tmp_path / "rec", 4)
+    listing(tmp_path / "rec", "rec_0.mcap", "rec_1.mcap")
+    write(tmp_path / "rec/lifted.mcap", [word(7)])
+    assert numbers(tmp_path / "rec") == (list(range(40)), None)  # beside another file the list alone counts
+    (tmp_path / "rec/lifted.mcap").unlink()
+    assert numbers(tmp_path / "rec") == (list(range(80)), None)
+    write(files[3], [word(n) for n in range(50)])
+    assert numbers(tmp_path / "rec") == (list(range(40)), None)
+
+
 def test_all_listed_files_are_missing(tmp_path):
     splits(tmp_path / "rec", 1)
     listing(tmp_path / "rec", "other_0.mcap")
@@ -223,6 +234,45 @@ def test_a_damaged_index_costs_no_message(tmp_path, size):
         path.write_bytes(changed)
         found, error = numbers(path)
         assert found == list(range(60)) and error is not None and "60 " in str(error)
+
+
+@pytest.mark.parametrize("chunk", [0, 500])
+@pytest.mark.parametrize(
+    "lacking",
+    [
+        {"index_types": IndexType.NONE},
+        {"use_statistics": False},
+        {"repeat_channels": False, "repeat_schemas": False},
+        {"use_summary_offsets": False, "enable_crcs": False},
+        {"enable_data_crcs": True},
+        {"index_types": IndexType.NONE, "use_statistics": False, "repeat_channels": False, "repeat_schemas": False},
+    ],
+)
+def test_whatever_a_fast_recorder_leaves_out(tmp_path, chunk, lacking):
+    with open(tmp_path / "a.mcap", "wb") as file:
+        writer = McapWriter(file, chunk_size=chunk, use_chunking=bool(chunk), **lacking)
+        writer.start("ros2", "a fast recorder")
+        channel = writer.register_channel("/words", "cdr", writer.register_schema(WORDS, "ros2msg", b"string data"))
+        for number in range(60, 0, -1):
+            writer.add_message(channel, number, word(number).data, number)
+        writer.finish()
+    assert numbers(tmp_path / "a.mcap") == (list(range(1, 61)), None)
+    assert topics_of(tmp_path / "a.mcap") == {"/words": (WORDS, 60)}
+
+
+@pytest.mark.parametrize("time", [-1, 2**63, 2**64 - 1])
+def test_impossible_log_times(tmp_path, time):
+    path = tmp_path / "a.mcap"
+    if time > 0:
+        odd = Record("/words", WORDS, word(1).data, time, word(1).definition)
+        write(path, [word(0), odd, word(2)])
+    else:
+        path = next(rosbag2(tmp_path / "rec", StoragePlugin.SQLITE3, count=3).glob("*.db3"))
+        with sqlite3.connect(path) as database:
+            database.execute("UPDATE messages SET timestamp = -5 WHERE id = 2")
+        database.close()
+    found, error = numbers(path)
+    assert found == [0, 2] and "no possible log time" in str(error)
 
 
 def test_messages_outside_chunks_are_read_on_too(tmp_path):

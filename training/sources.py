@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from paul_ros.layout import load_layout
+from paul_ros.offline.bag_folder import METADATA, bag_files
 from training.categories import load_files
 from training.data import TrainingData
 from training.errors import DataError
@@ -42,7 +43,7 @@ def loader_of(options: TrainingOptions) -> Loader:
 def is_motion_capture(paths: Sequence[Path]) -> bool:
     """Return whether the data is one folder that holds files of motion capture and is no bag."""
     path = Path(paths[0])
-    if len(paths) > 1 or not path.is_dir() or (path / "metadata.yaml").exists():
+    if len(paths) > 1 or not path.is_dir() or (path / METADATA).exists() or bag_files(path):
         return False
     from training.people.clips import motion_files
 
@@ -66,8 +67,6 @@ def load_keypoints(options: TrainingOptions, recipe: Recipe, device: torch.devic
 
 def _check_folder(path: Path) -> None:
     """Raise DataError if the path is a folder without recordings."""
-    from paul_ros.offline.bag_folder import METADATA, bag_files
-
     if path.is_dir() and not (path / METADATA).exists() and not bag_files(path):
         raise DataError(
             f"{path}: no recording in this folder (.mcap, .db3), and no motion capture (.asf with .amc, .bvh, .npz)"

@@ -35,18 +35,16 @@ def bag_files(folder: Path) -> list[Path]:
     return files or sorted(folder.glob("*.part"))
 
 
-def listed_files(folder: Path) -> tuple[list[Path], list[Path]] | None:
+def listed_files(folder: Path) -> tuple[list[Path], list[Path]]:
     """Return the files that metadata.yaml lists: those that are there, and the missing ones.
 
-    None: there is no metadata.yaml, or it is damaged, as a killed recorder leaves it.
+    Both are empty without metadata.yaml, or if it is damaged, as a killed recorder leaves it.
     """
     try:
         names = yaml.safe_load((folder / METADATA).read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
         wanted = list(dict.fromkeys(folder / Path(name).name for name in names))
     except (OSError, yaml.YAMLError, ValueError, RecursionError, KeyError, TypeError):
-        return None
-    if not wanted:
-        return None
+        return [], []
     found = {file: _packed_or_unpacked(file) for file in wanted}
     return [file for file in found.values() if file], [file for file, there in found.items() if not there]
 

@@ -8,6 +8,7 @@ where nothing behind it can be read. After all whole messages comes one BagError
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -55,23 +56,17 @@ class Recording:
             self.files = self._files_in(folder)
 
     def _files_in(self, folder: Path) -> list[BagFile]:
-        listed = listed_files(folder)
-        if listed and listed[0]:
-            files, self.missing = listed
-            return _in_order_of_time([BagFile(file) for file in files])
+        listed, self.missing = listed_files(folder)
         files = bag_files(folder)
-        if listed:
-            self.missing = listed[1]
-        if len(files) == 1:
-            return [BagFile(files[0])]
-        splits = Splits.of(files)
-        if splits is None:
-            raise BagError(_not_one(folder, files))
-        opened = {number: BagFile(file) for number, file in splits.files.items()}
-        if not _is_one_recording(opened):
-            raise BagError(_not_one(folder, files))
-        self.missing = self.missing or splits.missing
-        return _in_order_of_time(list(opened.values()))
+        # Files that metadata.yaml lacks belong to the recording if they follow it in name and in time.
+        splits = Splits.of([*listed, *(file for file in files if file not in listed)])
+        opened = {number: BagFile(file) for number, file in splits.files.items()} if splits else {}
+        if opened and _is_one_recording(opened):
+            self.missing = self.missing or (splits.missing if splits and not listed else [])
+            return _in_order_of_time(list(opened.values()))
+        if listed or len(files) == 1:
+            return _in_order_of_time([BagFile(file) for file in listed or files])
+        raise BagError(_not_one(folder, files))
 
     def records(self, topics: Iterable[str] | None = None) -> Iterator[Record]:
         """Yield the messages on some topics, as `read_records` does; raises the same BagError."""
@@ -172,17 +167,17 @@ def _is_one_recording(splits: dict[int, BagFile]) -> bool:
     """
     timed = [(number, *file.span) for number, file in splits.items() if file.span]
     longest = max((last - first for _, first, last in timed), default=0)
-    for (number, first, last), (next_number, next_first, next_last) in zip(timed, timed[1:]):
-        overlap = min(last, next_last) - max(first, next_first)
-        shorter = min(last - first, next_last - next_first)
+    for (number, first, last), (next_number, next_first, _) in zip(timed, timed[1:]):
         missing = next_number - number - 1
-        if overlap > _LARGEST_OVERLAP * shorter and overlap > 0:
+        if next_first < first or next_first - last > _LONGEST_PAUSE * (1 + missing) + longest * missing:
             return False
-        if max(first, next_first) - min(last, next_last) > _LONGEST_PAUSE * (1 + missing) + longest * missing:
-            return False
-        if next_last < first:
-            return False
-    return True
+    return not any(_overlap(one, other) for (_, *one), (_, *other) in itertools.combinations(timed, 2))
+
+
+def _overlap(one: list[int], other: list[int]) -> bool:
+    """Return whether two spans of time overlap by more than splits do."""
+    common = min(one[1], other[1]) - max(one[0], other[0])
+    return common > 0 and common > _LARGEST_OVERLAP * min(one[1] - one[0], other[1] - other[0])
 
 
 def _not_one(folder: Path, files: list[Path]) -> str:
