@@ -403,10 +403,13 @@ def test_names_are_no_part_of_the_database_address(tmp_path, name):
 def test_a_damaged_database_gives_what_is_whole(tmp_path):
     folder = rosbag2(tmp_path / "rec", StoragePlugin.SQLITE3, count=400)
     [file] = folder.glob("*.db3")
-    whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) // 2])
-    found, error = whole_numbers(folder)
-    assert 100 < len(found) < 400 and found == sorted(found) and "the database is damaged" in str(error)
+    whole, written = file.read_bytes(), [record.data for record in read_records(folder)]
+    for size in (len(whole) // 2, len(whole) - 1, len(whole) - 5000, len(whole) // 2 // 4096 * 4096):
+        file.write_bytes(whole[:size])
+        recording = Recording(folder)
+        found = [record.data for record in recording.whole_records()]
+        assert 100 < len(found) < 400 and all(data in written for data in found), size
+        assert "ends too early" in str(recording.damage)
     middle = len(whole) // 2 // 4096 * 4096
     file.write_bytes(whole[:middle] + bytes(4096) + whole[middle + 4096 :])
     found, error = whole_numbers(folder)

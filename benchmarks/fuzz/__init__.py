@@ -10,6 +10,7 @@ A case is one message, serialised message, bag, model file or layout.  It is mad
 - junk: the same with values of any type, None, nested rubbish and missing fields.  DDS cannot deliver such messages.
 - cdr: PointCloud2 as bytes, for the reader of serialised messages.  rosbags must read the same from them.
 - bags: bits flipped, bytes cut off, inserted and exchanged, and intact bags of broken messages; read and replayed.
+- recordings: splits of every storage and compression, one of them lost, cut or broken; judged by what was written.
 - models: the file, or its contents under a correct checksum.
 - layouts: the YAML text, or the values in it.
 

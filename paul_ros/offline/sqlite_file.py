@@ -9,7 +9,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import operator
+import os
+import shutil
 import sqlite3
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +26,7 @@ MAGIC = b"SQLite format 3\0"
 
 _ERRORS = (sqlite3.Error, UnicodeError)  # SQLite's own error text can hold damaged bytes
 
+_HEADER_BYTES = 100
 _SMALL_STEPS = 1000  # rows that are tried one by one behind damage; then the steps double
 
 
@@ -52,6 +56,8 @@ class SqliteFile:
         self.span: tuple[int, int] | None = None
         self._topics: dict[int, _Topic] = {}
         self._counts: dict[str, tuple[str, int]] = {}
+        if _is_cut(path):
+            self.problems.append("the file ends too early")
         try:
             with _connection(path) as database:
                 self._topics = _read_topics(database)
@@ -145,16 +151,41 @@ def _connection(path: Path) -> Iterator[sqlite3.Connection]:
     A write-ahead log beside the file holds the last messages of a recorder that was killed, or still records. SQLite
     reads it only in a folder that can be written to.
     """
-    log = path.with_name(path.name + "-wal")
-    mode = "mode=ro" if log.exists() and log.stat().st_size else "immutable=1"
-    database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
-    try:
+    with contextlib.ExitStack() as stack:
+        if path.stat().st_size % _page_bytes(path):
+            path = stack.enter_context(_whole_pages(path))
+        log = path.with_name(path.name + "-wal")
+        mode = "mode=ro" if log.exists() and log.stat().st_size else "immutable=1"
+        database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{mode}", uri=True)
+        stack.callback(database.close)
         # Otherwise SQLite refuses a whole file that was cut. Nothing is written in this mode.
         database.text_factory = lambda data: data.decode(errors="replace")
         database.execute("PRAGMA writable_schema = ON")
         yield database
-    finally:
-        database.close()
+
+
+def _page_bytes(path: Path) -> int:
+    """Return the size of a database's pages; at least 512 (https://sqlite.org/fileformat.html, "Page Size")."""
+    with open(path, "rb") as stream:
+        size = int.from_bytes(stream.read(_HEADER_BYTES)[16:18], "big")
+    return 65536 if size == 1 else max(size, 512)
+
+
+def _is_cut(path: Path) -> bool:
+    """Return whether a database has fewer pages than its header states. A write-ahead log may hold the others."""
+    with open(path, "rb") as stream:
+        pages = int.from_bytes(stream.read(_HEADER_BYTES)[28:32], "big")
+    return path.stat().st_size < pages * _page_bytes(path)
+
+
+@contextlib.contextmanager
+def _whole_pages(path: Path) -> Iterator[Path]:
+    """Give a copy of a cut database without the last page: SQLite takes what a page lacks for zeros."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        shutil.copyfile(path, copy)
+        os.truncate(copy, path.stat().st_size // _page_bytes(path) * _page_bytes(path))
+        yield copy
 
 
 def _read_topics(database: sqlite3.Connection) -> dict[int, _Topic]:
