@@ -4,15 +4,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import msg_adapters
+from paul_ros.errors import BagError
 from paul_ros.extras import require
 from paul_ros.layout import Layout
 from paul_ros.placement import centred_view
 from training.data import RawFrames
 from training.errors import DataError
+
+if TYPE_CHECKING:
+    from paul_ros.offline.bag_reader import Recording
 
 
 def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: float, guessed: bool) -> RawFrames:
@@ -31,9 +36,12 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
         DataError: it has no keypoints of the layout, or several topics or cameras.
     """
     require("train", "mcap", "rosbags")
+    from paul_ros.offline.bag_reader import Recording
+
     camera, image_size, rejections = _bag_camera(path)
+    recording = Recording(path)
     refused: dict[str, tuple[int, str]] = {}
-    frames = _bag_keypoints(path, layout, topic, image_size, rejections, refused, guessed)
+    frames = _bag_keypoints(recording, layout, topic, image_size, rejections, refused, guessed)
     if not frames:
         _check_topic(path, topic)
         raise DataError(
@@ -45,14 +53,22 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
     (messages,) = frames.values()
     xy = np.concatenate([message.xy for message in messages])
     visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for message in messages])
-    notes = tuple(
-        f"{count} messages left out, {reason}; of the last: {why}" for reason, (count, why) in refused.items()
-    )
+    notes = _losses(recording, refused)
     if camera is None:
         return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False, notes=notes)
     some = visible.any(1)
-    W = centred_view(xy[some], visible[some], camera).W
-    return RawFrames(W, visible[some], layout, calibrated=True, notes=notes)
+    rays = centred_view(xy[some], visible[some], camera).W
+    return RawFrames(rays, visible[some], layout, calibrated=True, notes=notes)
+
+
+def _losses(recording: Recording, refused: dict[str, tuple[int, str]]) -> tuple[str, ...]:
+    """Return notes of what could not be read: training goes on with the whole messages."""
+    notes = [f"{count} messages left out, {reason}; of the last: {why}" for reason, (count, why) in refused.items()]
+    if recording.damage:
+        # The folders of one machine are no provenance.
+        path = recording.path
+        notes.append(f"its whole messages are used: {str(recording.damage).replace(str(path), path.name)}")
+    return tuple(notes)
 
 
 def _check_topic(path: Path, topic: str | None) -> None:
@@ -67,7 +83,7 @@ def _check_topic(path: Path, topic: str | None) -> None:
 
 
 def _bag_keypoints(
-    path: Path,
+    recording: Recording,
     layout: Layout,
     topic: str | None,
     image_size: tuple[int, int] | None,
@@ -78,7 +94,7 @@ def _bag_keypoints(
     """Return keypoint messages by topic.
 
     Args:
-        path: of the bag.
+        recording: the bag.
         layout: of the points.
         topic: that is read, with * for any part of a name; None reads all.
         image_size: width and height in pixels, if known.
@@ -86,10 +102,10 @@ def _bag_keypoints(
         refused: is given the number of rejected messages by reason, and the last text.
         guessed: see ``read_bag``.
     """
-    from paul_ros.offline.bag_reader import matches, read_records
+    from paul_ros.offline.bag_reader import matches
 
     frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
-    for record in read_records(path):
+    for record in recording.whole_records():
         name, type_name = record.topic, record.type_name
         if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
             continue
@@ -97,9 +113,10 @@ def _bag_keypoints(
         source = msg_adapters.Source(layout.names, image_size, name, candidates=candidates)
         try:
             keypoints = msg_adapters.read(type_name, record.message(), len(layout.names), source)
-        except msg_adapters.MessageError as error:
+        except (BagError, msg_adapters.MessageError) as error:
             rejections[name] = str(error)
-            refused[error.reason] = refused.get(error.reason, (0, ""))[0] + 1, str(error)
+            reason = error.reason if isinstance(error, msg_adapters.MessageError) else "undecodable"
+            refused[reason] = refused.get(reason, (0, ""))[0] + 1, str(error)
         else:
             if keypoints.persons:
                 frames.setdefault(topic or name, []).append(keypoints)
@@ -112,15 +129,19 @@ def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, 
     Cameras are read before the keypoints: some keypoints are shares of the image size, and the first of them may come
     before any CameraInfo.
     """
-    from paul_ros.offline.bag_reader import read_records
+    from paul_ros.offline.bag_reader import Recording
 
     rejections: dict[str, str] = {}
     cameras: set[msg_adapters.Intrinsics] = set()
     sizes: set[tuple[int, int]] = set()
-    for record in read_records(path):
+    for record in Recording(path).whole_records():
         if record.type_name != "sensor_msgs/msg/CameraInfo":
             continue
-        info = record.message()
+        try:
+            info = record.message()
+        except BagError as error:
+            rejections[record.topic] = str(error)
+            continue
         # An uncalibrated camera has an image size too.
         sizes.add((int(info.width), int(info.height)))
         try:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from paul_ros.layout import load_layout
+from paul_ros.offline.bag_folder import METADATA, bag_files
 from training.categories import load_files
 from training.data import TrainingData
 from training.errors import DataError
@@ -16,7 +17,7 @@ from training.options import TrainingOptions
 def is_motion_capture(paths: Sequence[Path]) -> bool:
     """Return whether the data is one folder that holds files of motion capture and is no bag."""
     path = Path(paths[0])
-    if len(paths) > 1 or not path.is_dir() or (path / "metadata.yaml").exists():
+    if len(paths) > 1 or not path.is_dir() or (path / METADATA).exists() or bag_files(path):
         return False
     from training.people.clips import motion_files
 
@@ -36,9 +37,8 @@ def load_keypoints(options: TrainingOptions) -> TrainingData:
 
 
 def _check_folder(path: Path) -> None:
-    """Raise DataError if the path is a folder that is no bag."""
-    if path.is_dir() and not (path / "metadata.yaml").exists() and not any(path.glob("*.mcap")):
+    """Raise DataError if the path is a folder without recordings."""
+    if path.is_dir() and not (path / METADATA).exists() and not bag_files(path):
         raise DataError(
-            f"{path}: no .mcap file in this folder, and no motion capture (.asf with .amc, .bvh, .npz); convert other "
-            "bags with `ros2 bag convert`"
+            f"{path}: no recording in this folder (.mcap, .db3), and no motion capture (.asf with .amc, .bvh, .npz)"
         )
