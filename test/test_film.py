@@ -113,7 +113,7 @@ def test_no_keypoints_then(tmp_path, model_file):
 def test_no_keypoints_at_all(tmp_path, model_file, capsys):
     bag = make_bag(tmp_path / "short.mcap", 3)
     assert cli.main(["view", str(bag), "--topic", "/others", "-o", str(tmp_path / "f.gif")]) == 1
-    assert "no messages on /others; the bag holds" in capsys.readouterr().err
+    assert "no messages on /others; the topics with a type for keypoints are /keypoints" in capsys.readouterr().err
 
 
 def test_nobody_lifted(tmp_path, model_file):

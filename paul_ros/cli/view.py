@@ -67,9 +67,9 @@ def run(args: argparse.Namespace) -> None:
         BagError: the bag is damaged; the film shows what lies before the damage.
     """
     from paul_ros.model_file import load_model
+    from paul_ros.offline.bag_topics import Topics
     from paul_ros.offline.film import view_bag
     from paul_ros.offline.film_model import view_model
-    from paul_ros.offline.replay import Topics
     from paul_ros.stream.stream import open_stream
 
     thing, damage = Path(args.thing), None

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from paul_ros.offline.tables import Row, cell, render
+from paul_ros.wording import quantity
 
 _ERROR_ROWS = (
     ("N-MPJPE", "n_mpjpe_mm", "mm"),
@@ -33,7 +34,13 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
         f"  {report['frames']} frames, {report['persons']} persons, {report['lifted']} lifted; dropped: {dropped}",
         f"  model {report['model']} ({report['model_sha256'][:12]}), layout {report['layout']}, "
         f"units {report['units']}",
+        f"  keypoints {report['keypoints_topic']}, camera {report['camera_info_topic'] or 'none in the bag'}",
     ]
+    if report["units"] == "mixed":
+        without = quantity(report["frames_without_metres"], "frame")
+        lines.append(
+            f"  {without} without metres, before the first usable CameraInfo: left out of NE, root and distance errors"
+        )
     advice = report["advice"]
     lines += [f"  noted: {count} {what}: {advice[what]}" for what, count in report["noted"].items() if what in advice]
     lines.append("")
@@ -42,28 +49,36 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
     if report["persons_with_truth"]:
         lines.append(f"  {_who_is_judged(report)}")
         lifted, rigid = "lifted", "rigid"
-        rows = [(name, report[key], report["baseline"][key], unit) for name, key, unit in _ERROR_ROWS]
+        rows = [
+            (name, report[key], report["baseline"][key], _unit_or_why(report, key, unit))
+            for name, key, unit in _ERROR_ROWS
+        ]
         rows.append(())
     columns = (("", "text"), (lifted, ".1f"), (rigid, ".1f"), ("", "unit"))
     return "\n".join([*lines, render(columns, [*rows, *_figures(report), *further])])
 
 
 def _figures(report: dict) -> list[Row]:
-    """Return the rows that need no truth: name, figure, "", unit."""
+    """Return the rows that need no truth: name, figure, "", unit or why there is no figure."""
+    rows = (
+        ("reprojection, median", "reprojection_median_px", 1, "px"),
+        ("proven optimal", "certified_share", 100, "%"),
+        ("mirror ambiguous", "ambiguous_share", 100, "%"),
+        ("flips in depth", "flips_per_1000_frames", 1, "per 1000 pairs of frames"),
+        ("lift, median", "lift_us_median", 1, f"µs per frame (99 %: {cell(report['lift_us_p99'])})"),
+    )
     return [
-        ("reprojection, median", report["reprojection_median_px"], "", "px"),
-        ("proven optimal", _percent(report["certified_share"]), "", "%"),
-        ("mirror ambiguous", _percent(report["ambiguous_share"]), "", "%"),
-        ("flips in depth", report["flips_per_1000_frames"], "", "per 1000 pairs of frames"),
-        ("lift, median", report["lift_us_median"], "", f"µs per frame (99 %: {cell(report['lift_us_p99'])})"),
+        (name, None if report[key] is None else factor * report[key], "", _unit_or_why(report, key, unit))
+        for name, key, factor, unit in rows
     ]
+
+
+def _unit_or_why(report: dict, key: str, unit: str) -> str:
+    """Return the unit of a figure; if it is None, why."""
+    return report["unavailable"].get(key, unit)
 
 
 def _who_is_judged(report: dict) -> str:
     judged, persons, share = (report[key] for key in ("persons_with_truth", "persons", "points_with_truth_share"))
     points = "" if share == 1 else f", over {100 * share:.0f} % of their points"
     return f"errors of {judged} of {persons} persons, {100 * (1 - judged / persons):.1f} % left out{points}"
-
-
-def _percent(share: float | None) -> float | None:
-    return None if share is None else 100 * share
