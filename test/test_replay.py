@@ -18,8 +18,8 @@ from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
 from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages
-from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.bag_topics import Topics
+from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.depth_flips import count_flips
 from paul_ros.offline.judge import evaluate
 from paul_ros.offline.picture import write_picture

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +17,45 @@ from paul_ros.placement import centred_view
 from training.data import RawFrames
 from training.errors import DataError
 
+_JITTER = 0.01
+"""Largest difference of the intrinsics of one camera, over its focal length."""
 
-def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: float) -> RawFrames:
+
+@dataclass(frozen=True)
+class _Cameras:
+    """The CameraInfo of a bag.
+
+    Attributes:
+        intrinsics: usable ones with the log times (nanoseconds) from which they hold; those of one camera may differ
+            in the last digits.
+        image_size: width and height in pixels; None = unknown.
+        rejections: reasons of unusable messages by topic.
+    """
+
+    intrinsics: list[tuple[int, msg_adapters.Intrinsics]]
+    image_size: tuple[int, int] | None
+    rejections: dict[str, str]
+
+    def at(self, log_time: int) -> msg_adapters.Intrinsics:
+        """Return the latest intrinsics before a time, as replay does; before the first ones, the first."""
+        index = bisect.bisect_right(self.intrinsics, log_time, key=lambda timed: timed[0])
+        return self.intrinsics[max(index - 1, 0)][1]
+
+
+def read_bag(
+    path: Path, layout: Layout, topic: str | None, min_confidence: float, camera_info_topic: str | None = None
+) -> RawFrames:
     """Read the keypoints of a bag; see ``load_training_data``.
 
     Raises:
         MissingPackageError: the packages that read bags are missing.
-        BagError: the bag cannot be read.
-        DataError: it has no keypoints of the layout, or several topics or cameras.
+        BagError: the bag cannot be read, or the camera of the keypoints is not clear.
+        DataError: it has no keypoints of the layout, several topics of them, or a topic with several cameras.
     """
     require("train", "mcap", "rosbags")
-    camera, image_size, rejections = _bag_camera(path)
-    frames = _bag_keypoints(path, layout, topic, image_size, rejections)
+    cameras = _bag_cameras(path, topic, camera_info_topic)
+    rejections = dict(cameras.rejections)
+    frames = _bag_keypoints(path, layout, topic, cameras.image_size, rejections)
     if not frames:
         _check_topic(path, topic)
         raise DataError(
@@ -35,12 +65,23 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
     if len(frames) > 1:
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
     (messages,) = frames.values()
-    xy = np.concatenate([message.xy for message in messages])
-    visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for message in messages])
-    if camera is None:
+    xy = np.concatenate([message.xy for _, message in messages])
+    visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for _, message in messages])
+    if not cameras.intrinsics:
         return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False)
     some = visible.any(1)
-    return RawFrames(centred_view(xy[some], visible[some], camera).W, visible[some], layout, calibrated=True)
+    owners = [cameras.at(time) for time, message in messages for _ in range(message.persons)]
+    rays = _rays(xy[some], visible[some], [owners[row] for row in np.flatnonzero(some)])
+    return RawFrames(rays, visible[some], layout, calibrated=True)
+
+
+def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrinsics]) -> np.ndarray:
+    """Return pixels (F,P,2) as rays (F,2,P), each frame by its own camera."""
+    runs = [len(list(run)) for _, run in itertools.groupby(cameras)]
+    ends = np.cumsum(runs, dtype=int)
+    parts = [slice(end - length, end) for end, length in zip(ends, runs)]
+    views = [centred_view(xy[part], visible[part], cameras[part.start]).W for part in parts]
+    return np.concatenate([np.empty((0, 2, xy.shape[1])), *views])
 
 
 def _check_topic(path: Path, topic: str | None) -> None:
@@ -60,8 +101,8 @@ def _bag_keypoints(
     topic: str | None,
     image_size: tuple[int, int] | None,
     rejections: dict[str, str],
-) -> dict[str, list[msg_adapters.Keypoints2D]]:
-    """Return keypoint messages by topic.
+) -> dict[str, list[tuple[int, msg_adapters.Keypoints2D]]]:
+    """Return the log times (nanoseconds) and keypoints of messages by topic.
 
     Args:
         path: of the bag.
@@ -72,7 +113,7 @@ def _bag_keypoints(
     """
     from paul_ros.offline.bag_reader import matches, read_records
 
-    frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
+    frames: dict[str, list[tuple[int, msg_adapters.Keypoints2D]]] = {}
     for record in read_records(path):
         name, type_name = record.topic, record.type_name
         if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
@@ -84,35 +125,43 @@ def _bag_keypoints(
             rejections[name] = str(error)
         else:
             if keypoints.persons:
-                frames.setdefault(topic or name, []).append(keypoints)
+                frames.setdefault(topic or name, []).append((record.log_time, keypoints))
     return frames
 
 
-def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, int] | None, dict[str, str]]:
-    """Return the camera, the size of its image, and rejected CameraInfo messages as reasons by topic.
+def _bag_cameras(path: Path, keypoints: str | None, given: str | None) -> _Cameras:
+    """Read the CameraInfo that replay would use.
 
     Cameras are read before the keypoints: some keypoints are shares of the image size, and the first of them may come
     before any CameraInfo.
     """
     from paul_ros.offline.bag_reader import read_records
+    from paul_ros.offline.bag_topics import choose_camera, topics_in
 
-    rejections: dict[str, str] = {}
-    cameras: set[msg_adapters.Intrinsics] = set()
+    topic = choose_camera(path, topics_in(path), given, keypoints)
+    found: list[tuple[int, msg_adapters.Intrinsics]] = []
     sizes: set[tuple[int, int]] = set()
-    for record in read_records(path):
-        if record.type_name != "sensor_msgs/msg/CameraInfo":
-            continue
+    rejections: dict[str, str] = {}
+    for record in read_records(path, [topic]) if topic else ():
         info = record.message()
         # An uncalibrated camera has an image size too.
         sizes.add((int(info.width), int(info.height)))
         try:
-            cameras.add(msg_adapters.read_camera_info(info))
+            camera = msg_adapters.read_camera_info(info)
         except msg_adapters.MessageError as error:
             rejections[record.topic] = str(error)
-    count = max(len(cameras), len(sizes))
-    if count > 1:
-        raise DataError(f"'{path}' has CameraInfo of {count} cameras: keep that of the keypoints only")
-    return cameras.pop() if cameras else None, sizes.pop() if sizes else None, rejections
+            continue
+        if not found or found[-1][1] != camera:
+            found.append((record.log_time, camera))
+    if len(sizes) > 1 or not all(_same_camera(found[0][1], camera) for _, camera in found):
+        raise DataError(f"'{path}' has CameraInfo of several cameras on {topic}: keep that of the keypoints only")
+    return _Cameras(found, sizes.pop() if sizes else None, rejections)
+
+
+def _same_camera(one: msg_adapters.Intrinsics, other: msg_adapters.Intrinsics) -> bool:
+    """Return whether two intrinsics are those of one camera, whose calibration may be sent with jitter."""
+    difference = [abs(getattr(one, name) - getattr(other, name)) for name in ("fx", "fy", "cx", "cy")]
+    return max(difference) <= _JITTER * one.fx
 
 
 def _reasons(rejections: dict[str, str]) -> str:

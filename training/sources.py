@@ -59,7 +59,7 @@ def load_keypoints(options: TrainingOptions, recipe: Recipe, device: torch.devic
     for path in options.data:
         _check_folder(Path(path))
     layout = load_layout(options.layout) if options.layout else None
-    data = load_files(options.data, layout, options.topic, options.min_confidence)
+    data = load_files(options.data, layout, options.topic, options.min_confidence, options.camera_info_topic)
     check_recipe(options, recipe, data.layout)
     return data, replace(recipe, views=None)
 

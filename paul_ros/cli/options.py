@@ -84,7 +84,7 @@ def add_camera_info_topic(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--camera-info-topic",
         metavar="TOPIC",
-        help="topic of the camera (default: the only CameraInfo of the bag; a bag without one gives no metres)",
+        help="topic of the camera of the keypoints (default: the only CameraInfo of the bag)",
     )
 
 

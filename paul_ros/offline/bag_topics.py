@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msg_adapters import SUPPORTED
-from paul_ros.errors import BagError
+from paul_ros.errors import BagError, WrongTopicError
 from paul_ros.extras import require
 from paul_ros.offline.bag_reader import matches, read_records
 from paul_ros.wording import nearest
@@ -40,6 +40,14 @@ class Role:
     option: str
     types: Collection[str]
     default: str = ""
+
+    def check(self, topic: str, type_name: str) -> None:
+        """Raise WrongTopicError if a topic's type cannot be read in this role."""
+        if type_name not in self.types:
+            raise WrongTopicError(
+                f"{topic} is a {type_name}, not readable as {self.name} ({' or '.join(self.types)} is): "
+                f"choose another with {self.option}"
+            )
 
 
 KEYPOINTS = Role("keypoints", "--topic", SUPPORTED, "/keypoints")
@@ -72,6 +80,7 @@ class Topics:
         Raises:
             BagError: the bag cannot be read, a given topic has no messages, there are no keypoints, or there are
                 several CameraInfo topics and none is given.
+            WrongTopicError: a topic has a type that cannot be read in its role.
         """
         held = topics_in(bag)
         keypoints = _keypoints(bag, held, self.keypoints)
@@ -175,7 +184,10 @@ def _in_messages(bag: Path) -> dict[str, str]:
 
 def _keypoints(bag: Path, held: dict[str, str], given: str | None) -> str:
     name = given or KEYPOINTS.default
-    if any(matches(topic, name) for topic in held):
+    named = [topic for topic in held if matches(topic, name)]
+    for topic in named:
+        KEYPOINTS.check(topic, held[topic])
+    if named:
         return name
     made_for_it = [topic for topic, kind in held.items() if kind in SUPPORTED and kind not in _AMBIGUOUS]
     if given or len(made_for_it) != 1:
@@ -185,9 +197,13 @@ def _keypoints(bag: Path, held: dict[str, str], given: str | None) -> str:
 
 def _named(bag: Path, held: dict[str, str], role: Role, given: str | None) -> str | None:
     """Return the given topic, or the role's default if the bag has it."""
-    if given and given not in held:
+    name = given or role.default
+    if name in held:
+        role.check(name, held[name])
+        return name
+    if given:
         raise BagError(_no_messages(bag, held, role, given))
-    return given or (role.default if role.default in held else None)
+    return None
 
 
 def _no_messages(bag: Path, held: dict[str, str], role: Role, name: str) -> str:

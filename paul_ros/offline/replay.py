@@ -231,11 +231,7 @@ class _OfflineNode:
         Raises:
             WrongTopicError: the topic's type cannot be read in its role.
         """
-        if record.type_name not in role.types:
-            raise WrongTopicError(
-                f"{record.topic} is a {record.type_name}, not readable as {role.name} ({' or '.join(role.types)} is): "
-                f"choose another with {role.option}"
-            )
+        role.check(record.topic, record.type_name)
         try:
             message = record.message()
         except BagError as error:
