@@ -6,6 +6,7 @@ A wrong camera gives wrong metres without a word. So a choice between several is
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,10 +143,12 @@ def topics_in(bag: Path) -> dict[str, str]:
         BagError: nothing can be read.
     """
     files = sorted(bag.glob("*.mcap")) if bag.is_dir() else [bag]
-    summaries = [_in_summary(file) for file in files]
-    if not files or None in summaries:
-        return _in_messages(bag)
-    return {topic: kind for summary in summaries for topic, kind in (summary or {}).items()}
+    held: dict[str, str] = {}
+    for file in files:
+        with contextlib.suppress(BagError):  # a file without a message; if all are, the bag itself is read below
+            summary = _in_summary(file)
+            held.update(_in_messages(file) if summary is None else summary)
+    return held or _in_messages(bag)
 
 
 def _in_summary(file: Path) -> dict[str, str] | None:
