@@ -22,6 +22,13 @@ UNLIKE_MODEL = 0.5
 """Unexplained share above which a person is hardly a shape of the model. Persons in the bags reach 0.37, with noise of
 5 % of the height 0.42. If COCO's points are taken for Human3.6M's or the reverse, 97 % of the persons exceed 0.5."""
 
+OPTICAL_FRAME = "optical frame of the camera (REP-103): x right, y down, z forward"
+"""Axes of points that were lifted with a camera."""
+
+IMAGE_AXES = "axes of the image: x right, y down, z away from the viewer along the line of sight to each person"
+"""Axes of points that were lifted without a camera: only its intrinsics tell how far its own axes are turned from the
+line of sight."""
+
 MIN_EXTENT = 1.0
 """Pixels, rms distance of the visible points from their mean: a smaller image cannot show a pose."""
 
@@ -38,8 +45,9 @@ class Lifted:
     Lifted(2 persons, 0 lifted, m, coco17)
 
     Attributes:
-        points: (N,P,3) points of ``layout`` in the camera's optical frame (x right, y down, z forward). They are
-            metres from the camera's centre if ``units`` is ``"m"``, else model units from the root. NaN if not lifted.
+        points: (N,P,3) points of ``layout`` in the camera's optical frame (x right, y down, z forward). Without a
+            camera, z is the line of sight to each person. They are metres from the camera's centre if ``units`` is
+            ``"m"``, else model units from the root. NaN if not lifted.
         root: (N,3) root point of the model's layout, same frame and units. In shipped layouts this is the middle of
             the hips in ``points``, except if the pelvis was seen but not both hips.
         rotation: (N,3,3) canonical frame to camera frame, det +1.

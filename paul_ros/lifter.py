@@ -235,11 +235,15 @@ class Lifter:
         shape[..., point] = np.where(known[:, None], shape[..., parts].mean(2), shape[..., point])
 
     def _placed(self, shape: np.ndarray, fit: ShapeFit, view: CentredView | None) -> tuple[np.ndarray, str]:
-        """Return points (N,P,3) and their units: metres in the camera frame, or model units from the root."""
+        """Return points (N,P,3) in the camera's optical frame, and their units.
+
+        They are metres from the camera if it and the model's metres are known, else model units from the root.
+        """
         if view is not None and self.metres_per_unit:
-            return place(shape + fit.T[:, :, None], view.turn, self.metres_per_unit), "m"
+            return place(shape + fit.T[:, :, None], view, self.metres_per_unit), "m"
         root = list(self.model.layout.root)
-        return (shape - shape[:, :, root].mean(2, keepdims=True)).transpose(0, 2, 1), "model"
+        from_root = shape - shape[:, :, root].mean(2, keepdims=True)
+        return from_root.transpose(0, 2, 1) if view is None else place(from_root, view, 1.0), "model"
 
     def _distance_sigma(self, root: np.ndarray, unexplained: np.ndarray, units: str) -> np.ndarray:
         if units != "m":

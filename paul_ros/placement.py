@@ -72,15 +72,15 @@ def _turn_from_axis(direction: np.ndarray) -> np.ndarray:
     return about_middle * _ABOUT_AXIS
 
 
-def place(shape: np.ndarray, turn: np.ndarray, metres_per_unit: np.ndarray | float) -> np.ndarray:
-    """Place lifted shapes in the real camera's frame.
+def place(shape: np.ndarray, view: CentredView, unit: np.ndarray | float) -> np.ndarray:
+    """Turn shapes from the frames of their virtual cameras to the real camera's frame, and scale them.
 
     Args:
         shape: (N,3,P) model units, in the frames of the virtual cameras.
-        turn: (N,3,3) rotations from the virtual cameras to the real one.
-        metres_per_unit: metres per model unit, one number, or one per person (N,).
+        view: the virtual cameras.
+        unit: wanted length of a model unit, one number, or one per person (N,): metres, or 1 for model units.
 
     Returns:
-        Points (N,P,3) in metres in the real camera's optical frame (REP-103: z forward, x right, y down).
+        Points (N,P,3) in the real camera's optical frame (REP-103: z forward, x right, y down).
     """
-    return np.reshape(metres_per_unit, (-1, 1, 1)) * (turn @ shape).transpose(0, 2, 1)
+    return np.reshape(unit, (-1, 1, 1)) * (view.turn @ shape).transpose(0, 2, 1)

@@ -173,7 +173,7 @@ def test_the_output_states_what_it_is(persons, model_file, tmp_path, capsys):
     metres, units = read(tmp_path / "m.npz"), read(tmp_path / "units.npz")
     assert (str(metres["units"]), str(units["units"])) == ("m", "model")
     assert str(metres["coordinate_frame"]).endswith("z forward; origin at the camera")
-    assert str(units["coordinate_frame"]).endswith("z forward; origin at each person's root")
+    assert str(units["coordinate_frame"]).endswith("line of sight to each person; origin at each person's root")
     np.testing.assert_allclose(metres["root"][:, 2], [4, 5, 6, 3, 7], rtol=0.05)
     np.testing.assert_allclose(units["root"], 0, atol=1e-9)
     assert np.isfinite(metres["distance_sigma"]).all() and np.isnan(units["distance_sigma"]).all()

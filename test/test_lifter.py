@@ -84,6 +84,20 @@ def test_without_intrinsics_output_is_in_model_units_from_the_root(rigid_lifter,
     )
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_in_model_units_points_are_in_the_cameras_frame_as_in_metres(model, seed):
+    """A model that does not know its metres differs in the origin and the unit only, wherever a person stands."""
+    unscaled = replace(model, header={**model.header, "metres_per_unit": None, "stature": None})
+    rng = np.random.default_rng(seed)
+    truth = np.concatenate([standing(model, rng.uniform([-5, -2, 5], [5, 2, 9]), rng.uniform(0, 6)) for _ in range(8)])
+    xy, visible = pinhole(truth) + rng.normal(0, 3, truth[..., :2].shape), rng.random(truth.shape[:2]) > 0.2
+    metric, plain = (Lifter(each).lift(xy, visible, CAMERA) for each in (model, unscaled))
+    assert metric.units == "m" and plain.units == "model" and metric.ok.sum() > 6
+    ok, unit = metric.ok, model.metres_per_unit
+    np.testing.assert_allclose(plain.points[ok] * unit, (metric.points - metric.root[:, None])[ok], atol=1e-9)
+    np.testing.assert_allclose(plain.rotation[ok], metric.rotation[ok], atol=1e-9)
+
+
 def test_twice_as_far_is_half_as_large(rigid_lifter, model):
     near, far = (
         rigid_lifter.lift(pinhole(p), everything(p), CAMERA)

@@ -16,6 +16,7 @@ from paul_ros.errors import BagError, OutputError, PictureError
 from paul_ros.files import write_json
 from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
+from paul_ros.model_file import load_model
 from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_topics import Topics
@@ -25,7 +26,7 @@ from paul_ros.offline.judge import evaluate
 from paul_ros.offline.picture import write_picture
 from paul_ros.offline.replay import replay
 from paul_ros.offline.report import table
-from paul_ros.stream.stream import open_stream
+from paul_ros.stream.stream import LiftStream, open_stream
 
 ROOT = Path(__file__).resolve().parent.parent
 BAGS = ROOT / "bags"
@@ -484,6 +485,15 @@ def test_a_flip_needs_an_image_that_stays(deepest, growth, shift, flips):
     given = replace(deepest.given, xy=deepest.given.xy + growth * (deepest.given.xy - middle) + shift)
     counted = count_flips([deepest, replace(deepest, lifted=lifted, given=given)])
     assert counted == {"pairs_of_frames": 1, "flips_per_1000_frames": 1000 * flips}
+
+
+def test_a_model_without_metres_has_the_attitudes_and_the_flips_of_one_with_them(short):
+    model = load_model("human")
+    unscaled = replace(model, header={**model.header, "metres_per_unit": None, "stature": None})
+    metric, plain = (evaluate(replay(short, LiftStream(Lifter(each), None, 0.3, 64))) for each in (model, unscaled))
+    assert (metric["units"], plain["units"]) == ("m", "model")
+    for key in ("n_mpjpe_mm", "pa_mpjpe_mm", "flips_per_1000_frames"):
+        assert plain[key] == pytest.approx(metric[key], rel=1e-6), key
 
 
 def test_persons_without_id_have_no_flips(short, model_file):

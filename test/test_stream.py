@@ -155,6 +155,12 @@ def test_description_says_what_the_outputs_mean(stream, model_file):
     assert described["metres_per_unit"] == model.metres_per_unit and described["chirality"]["known"] is True
 
 
+def test_description_says_whose_axes_the_points_have(stream, make):
+    assert "line of sight to each person" in stream.describe()["frame"]
+    stream.camera_info(camera_info(make))
+    assert "optical frame of the camera (REP-103)" in stream.describe()["frame"]
+
+
 def test_low_confidence_hides_a_point_at_once_when_changed(stream, make):
     message = cloud(make, seen(GOOD), np.full((2, 17), 0.2))
     assert not stream.keypoints(CLOUD, message).frame.lifted.ok.any()

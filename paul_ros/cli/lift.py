@@ -44,7 +44,8 @@ input, N persons of P keypoints in pixels (x right, y down), NaN where hidden:
          A keypoint is [x, y], [x, y, confidence] or null. The keypoints may
          also be one flat list x, y, confidence, x, y, ... as in COCO.
 
-output, in the optical frame of the camera (x right, y down, z forward):
+output, in the optical frame of the camera (x right, y down, z forward; without
+a camera, z is the line of sight to each person):
   points:          (N,P,3), and root: (N,3)
   distance_sigma:  (N,) standard deviation of the root's distance in metres
   ambiguity:       (N,) 0..1; near 1 the depth-reversed pose fits as well
@@ -142,13 +143,14 @@ def _lift(
 ) -> str:
     """Lift from file to file; count persons in `tally` by reason. Return the line for the user."""
     from paul_ros.layout import load_layout
+    from paul_ros.lifted import IMAGE_AXES, OPTICAL_FRAME
     from paul_ros.offline.arrays import lift_persons
     from paul_ros.offline.keypoint_files import open_keypoints
     from paul_ros.offline.lifted_files import LiftedFile
     from paul_ros.route import Route, find_output_layout
 
     camera, model = _camera(args), lifter.model
-    units = "m" if camera and lifter.metres_per_unit else "model"
+    units, axes = "m" if camera and lifter.metres_per_unit else "model", OPTICAL_FRAME if camera else IMAGE_AXES
     with _open_input(args.input) as file:
         layout = load_layout(args.layout) if args.layout else None
         name = "standard input" if args.input == STDOUT else str(args.input)
@@ -157,7 +159,7 @@ def _lift(
         route = Route.between(keypoints.layout, model.layout, output)
         lifted = lift_persons(keypoints.batches, lifter, route, camera, min_confidence)
         with open_output(args.output) as out, progress("lift", "person", keypoints.persons) as count:
-            LiftedFile(route.output, model, units).write(out, kinds[1], _counted(lifted, tally, count))
+            LiftedFile(route.output, model, units, axes).write(out, kinds[1], _counted(lifted, tally, count))
     return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, camera, route.given.name)])
 
 

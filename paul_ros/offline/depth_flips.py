@@ -66,15 +66,25 @@ def _flipped(before: tuple[LiftedFrame, int], now: tuple[LiftedFrame, int]) -> b
     """Return whether a person, given as frame and row, flipped between two frames."""
     old, new = (_about_mean(frame.lifted.points[row]) for frame, row in (before, now))
     frame, row = before
-    # In model units the root is the origin, and the camera looks along z.
-    ray = frame.lifted.root[row] if frame.lifted.units == "m" else np.array([0.0, 0.0, 1.0])
-    ray = ray / np.linalg.norm(ray, axis=-1)
+    ray = _viewing_direction(*before)
     mirrored = old - 2 * (old @ ray)[:, None] * ray
     seen_twice = before[0].given.visible[before[1]] & now[0].given.visible[now[1]]
     images = [_about_mean(frame.given.xy[row][seen_twice]) for frame, row in (before, now)]
     still = np.linalg.norm(images[1] - images[0]) < _FLIP_SHARE * np.linalg.norm(images[0])
     moved = np.linalg.norm(new - old)
     return bool(still and np.linalg.norm(new - mirrored) < moved and moved > _FLIP_SHARE * np.linalg.norm(old))
+
+
+def _viewing_direction(frame: LiftedFrame, row: int) -> np.ndarray:
+    """Return the unit direction (3,) in which a person is seen; along z without a camera."""
+    ray = np.array([0.0, 0.0, 1.0])
+    if frame.lifted.units == "m":
+        ray = frame.lifted.root[row]
+    elif camera := frame.camera:
+        # In model units the root is the origin.
+        x, y = frame.given.xy[row][frame.given.visible[row]].mean(0)
+        ray = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0])
+    return ray / np.linalg.norm(ray, axis=-1)
 
 
 def _about_mean(points: np.ndarray) -> np.ndarray:

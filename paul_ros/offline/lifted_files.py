@@ -19,7 +19,6 @@ from paul_ros.offline.arrays import Persons
 
 Batches = Iterable[tuple[Persons, Lifted]]
 
-_AXES = "optical frame of the camera (REP-103): x right, y down, z forward; origin at "
 _ORIGINS = {"m": "the camera", "model": "each person's root"}
 _CSV_COLUMNS = "frame,person,keypoint,x,y,z,root_x,root_y,root_z,ambiguity,certified,distance_sigma,reason,units".split(
     ","
@@ -34,11 +33,13 @@ class LiftedFile:
         layout: of the points.
         model: that lifted them.
         units: "m" or "model".
+        axes: of the points, in words.
     """
 
     layout: Layout
     model: Model
     units: str
+    axes: str
 
     def write(self, file: BinaryIO, kind: str, batches: Batches) -> None:
         """Write `npz`, `csv` or `json`; csv and json batch by batch. `paul lift --help` describes them."""
@@ -48,7 +49,7 @@ class LiftedFile:
     def _stated(self) -> dict[str, Any]:
         return {
             "units": self.units,
-            "coordinate_frame": _AXES + _ORIGINS[self.units],
+            "coordinate_frame": f"{self.axes}; origin at {_ORIGINS[self.units]}",
             "layout": self.layout.name,
             "keypoints": list(self.layout.names),
             "model": self.model.name,

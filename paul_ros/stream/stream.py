@@ -23,7 +23,7 @@ from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, WrongPoi
 from msg_adapters.cdr import CloudReader
 from paul_ros.body_axes import left_and_up
 from paul_ros.layout import Layout, load_layout
-from paul_ros.lifted import UNLIKE_MODEL, Lifted
+from paul_ros.lifted import IMAGE_AXES, OPTICAL_FRAME, UNLIKE_MODEL, Lifted
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.route import Route, find_output_layout
@@ -251,7 +251,7 @@ class LiftStream:
             "input_layout": self.route.given.name if self._known else None,
             "model_layout": model.layout.name,
             "units": self.units,
-            "frame": "header.frame_id of the input, an optical frame (REP-103): x right, y down, z forward",
+            "frame": f"header.frame_id of the input; {OPTICAL_FRAME if self.intrinsics else IMAGE_AXES}",
             "scale_source": advice.scale_source(self.intrinsics, model.metres_per_unit),
             "person_height": self.person_height or model.stature,
             "size_spread": self.lifter.size_spread,
