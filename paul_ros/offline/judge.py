@@ -239,7 +239,7 @@ def _no_metres(done: Replay) -> str:
     """Return why no person was lifted in metres."""
     if done.stream.lifter.model.metres_per_unit is None:
         return "the model does not know its size"
-    return "no CameraInfo was usable" if done.topics.camera_info else "the bag has no CameraInfo"
+    return "no usable CameraInfo came before the keypoints" if done.topics.camera_info else "the bag has no CameraInfo"
 
 
 def _no_truth(done: Replay) -> str:
