@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
@@ -103,7 +101,7 @@ def test_a_record_is_copied_as_it_is(bag, tmp_path):
 
 
 def test_cut_anywhere_gives_what_was_whole(bag, tmp_path):
-    """Never more, never other messages, never another kind of error; half a file gives about half of them."""
+    """Never other messages, never another kind of error; half a file gives about half of them."""
     whole = bag.read_bytes()
     cut, counts = tmp_path / "cut.mcap", []
     for size in [*np.linspace(9, len(whole) - 1, 60).astype(int), len(whole) - 1, len(whole) - 8]:
@@ -117,7 +115,8 @@ def test_cut_anywhere_gives_what_was_whole(bag, tmp_path):
     assert 50 < counts[30] < 140
 
 
-def test_any_changed_byte_is_noticed(bag, tmp_path):
+def test_any_changed_byte_is_noticed_and_costs_one_chunk(bag, tmp_path):
+    """The messages behind the damage are read too."""
     whole, rng = bag.read_bytes(), np.random.default_rng(1)
     bad = tmp_path / "bad.mcap"
     expected = [time for *_, time in read_messages(bag)]
@@ -127,7 +126,9 @@ def test_any_changed_byte_is_noticed(bag, tmp_path):
         bad.write_bytes(changed)
         found, error = read_until_damage(bad)
         assert error is not None, f"byte {place}"
-        assert [time for *_, time in found] == expected[: len(found)]
+        times = [time for *_, time in found]
+        assert times == sorted(times) and set(times) <= set(expected)
+        assert place < 8 or len(times) >= len(expected) - 64, f"byte {place}"
 
 
 @pytest.fixture
@@ -159,7 +160,7 @@ def test_a_message_that_the_end_cuts_is_not_read(unchunked):
 
 
 @pytest.mark.parametrize(
-    "described, clue", [((), "a message is of channel 1, which"), (("channel",), "/poses has no schema")]
+    "described, clue", [((), "messages are of channel 1, which"), (("channel",), "message without type (cdr)")]
 )
 def test_a_message_that_the_file_does_not_describe(described, clue, tmp_path):
     path = tmp_path / "odd.mcap"
@@ -171,7 +172,7 @@ def test_a_message_that_the_file_does_not_describe(described, clue, tmp_path):
         writer.add_message(1, 0, bytes(8), 0)
         writer.finish()
     found, error = read_until_damage(path)
-    assert not found and error is not None and f"damaged after 0 whole messages ({clue}" in str(error)
+    assert not found and error is not None and clue in str(error)
 
 
 def test_a_length_that_no_file_can_hold(unchunked):
@@ -193,9 +194,11 @@ def test_bytes_after_the_end_are_noticed(unchunked):
     "content, clue",
     [
         (b"", "empty"),
-        (b"SQLite format 3\0" + bytes(100), "not an mcap file"),
+        (b"SQLite format 3\0" + bytes(100), "the database is damaged"),
+        (b"#ROSBAG V2.0\n", "rosbags-convert --src"),
+        (b"\x28\xb5\x2f\xfd" + bytes(9), "the compressed file is damaged"),
         (b"\x89MCAP0\r\n", "ends too early"),
-        (b"\x89MC", "not an mcap file"),
+        (b"\x89MC", "not an mcap or sqlite3 file"),
     ],
 )
 def test_other_files_are_refused(tmp_path, content, clue):
@@ -211,22 +214,9 @@ def test_missing_bag(tmp_path):
 
 
 def test_folder_without_mcap(tmp_path):
-    (tmp_path / "old.db3").write_bytes(b"")
-    with pytest.raises(BagError, match="ros2 bag convert"):
+    (tmp_path / "notes.txt").write_bytes(b"")
+    with pytest.raises(BagError, match="no recording in this folder"):
         list(read_messages(tmp_path))
-
-
-def test_rosbag2_folder_of_several_files(tmp_path, bag):
-    """As a recorder splits them: metadata.yaml gives the order, not the names."""
-    shutil.copy(bag, tmp_path / "z.mcap")
-    write(tmp_path / "a.mcap", 3)
-    assert len(list(read_messages(tmp_path))) == 206
-    (tmp_path / "metadata.yaml").write_text(
-        "rosbag2_bagfile_information:\n  relative_file_paths:\n  - z.mcap\n  - a.mcap\n"
-    )
-    assert [time for *_, time in read_messages(tmp_path)][-6:] == [n // 2 * TICK + n % 2 for n in range(6)]
-    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  rela")
-    assert len(list(read_messages(tmp_path))) == 206
 
 
 def test_bag_of_another_writer_with_a_type_nobody_installed(tmp_path):

@@ -225,7 +225,7 @@ def test_half_a_bag(model_file, tmp_path):
     half.write_bytes(ONE.read_bytes()[:500_000])
     done = paul("replay", half, "--model", model_file, "-o", tmp_path / "out.mcap", "--json", tmp_path / "r.json")
     assert done.returncode == 1
-    assert done.stderr.startswith(f"paul: {half}: damaged after ") and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"paul: {half}: damaged: ") and done.stderr.count("\n") == 1
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["frames"] > 150 and report["damage"] in done.stderr
     assert (tmp_path / "out.mcap").exists()
@@ -339,8 +339,8 @@ def test_inspect_a_damaged_bag(tmp_path, capsys):
     half.write_bytes(ONE.read_bytes()[:500_000])
     assert cli.main(["inspect", str(half)]) == 1
     printed = capsys.readouterr()
-    assert "/keypoints" in printed.out and "damaged after" not in printed.out
-    assert "damaged after" in printed.err and printed.err.count("\n") == 1
+    assert "/keypoints" in printed.out and "damaged:" not in printed.out
+    assert "damaged:" in printed.err and printed.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("layout", ["coco17", "cmu31"])

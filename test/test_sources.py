@@ -43,7 +43,7 @@ def test_motion_capture_is_a_folder_of_its_files_that_is_no_bag(tmp_path):
 
 def test_a_folder_without_data_is_explained(tmp_path):
     options = TrainingOptions(data=(tmp_path,), model=tmp_path / "m.npz", recipe="default")
-    with pytest.raises(DataError, match="no .mcap file in this folder, and no motion capture"):
+    with pytest.raises(DataError, match=r"no recording in this folder \(.mcap, .db3\), and no motion capture"):
         loader_of(options)(options, Recipe(), torch.device("cpu"))
 
 

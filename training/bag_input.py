@@ -7,15 +7,20 @@ import bisect
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import msg_adapters
+from paul_ros.errors import BagError
 from paul_ros.extras import require
 from paul_ros.layout import Layout
 from paul_ros.placement import centred_view
 from training.data import RawFrames
 from training.errors import DataError
+
+if TYPE_CHECKING:
+    from paul_ros.offline.bag_reader import Recording
 
 _JITTER = 0.01
 """Largest difference of the intrinsics of one camera, over its focal length."""
@@ -53,9 +58,12 @@ def read_bag(
         DataError: it has no keypoints of the layout, several topics of them, or a topic with several cameras.
     """
     require("train", "mcap", "rosbags")
+    from paul_ros.offline.bag_reader import Recording, matches
+
     cameras = _bag_cameras(path, topic, camera_info_topic)
     rejections = dict(cameras.rejections)
-    frames = _bag_keypoints(path, layout, topic, cameras.image_size, rejections)
+    recording = Recording(path)
+    frames = _bag_keypoints(recording, layout, topic, cameras.image_size, rejections)
     if not frames:
         _check_topic(path, topic)
         raise DataError(
@@ -64,15 +72,16 @@ def read_bag(
         )
     if len(frames) > 1:
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
-    (messages,) = frames.values()
+    ((name, messages),) = frames.items()
+    notes = _losses(recording, {of: why for of, why in rejections.items() if matches(of, name)})
     xy = np.concatenate([message.xy for _, message in messages])
     visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for _, message in messages])
     if not cameras.intrinsics:
-        return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False)
+        return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False, notes=notes)
     some = visible.any(1)
     owners = [cameras.at(time) for time, message in messages for _ in range(message.persons)]
     rays = _rays(xy[some], visible[some], [owners[row] for row in np.flatnonzero(some)])
-    return RawFrames(rays, visible[some], layout, calibrated=True)
+    return RawFrames(rays, visible[some], layout, calibrated=True, notes=notes)
 
 
 def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrinsics]) -> np.ndarray:
@@ -82,6 +91,17 @@ def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrin
     parts = [slice(end - length, end) for end, length in zip(ends, runs)]
     views = [centred_view(xy[part], visible[part], cameras[part.start]).W for part in parts]
     return np.concatenate([np.empty((0, 2, xy.shape[1])), *views])
+
+
+def _losses(recording: Recording, rejections: dict[str, str]) -> tuple[str, ...]:
+    """Return notes of what could not be read: training goes on with the whole messages."""
+    path, notes = recording.path, []
+    if recording.damage:
+        # The folders of one machine are no provenance.
+        notes.append(f"its whole messages are used: {str(recording.damage).replace(str(path), path.name)}")
+    if rejections:
+        notes.append(f"messages of '{path.name}' are left out{_reasons(rejections)}")
+    return tuple(notes)
 
 
 def _check_topic(path: Path, topic: str | None) -> None:
@@ -96,7 +116,7 @@ def _check_topic(path: Path, topic: str | None) -> None:
 
 
 def _bag_keypoints(
-    path: Path,
+    recording: Recording,
     layout: Layout,
     topic: str | None,
     image_size: tuple[int, int] | None,
@@ -105,23 +125,23 @@ def _bag_keypoints(
     """Return the log times (nanoseconds) and keypoints of messages by topic.
 
     Args:
-        path: of the bag.
+        recording: the bag.
         layout: of the points.
         topic: that is read, with * for any part of a name; None reads all.
         image_size: width and height in pixels, if known.
         rejections: is given the last reason for which messages of a topic were rejected.
     """
-    from paul_ros.offline.bag_reader import matches, read_records
+    from paul_ros.offline.bag_reader import matches
 
     frames: dict[str, list[tuple[int, msg_adapters.Keypoints2D]]] = {}
-    for record in read_records(path):
+    for record in recording.whole_records():
         name, type_name = record.topic, record.type_name
         if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
             continue
         source = msg_adapters.Source(layout.names, image_size, name)
         try:
             keypoints = msg_adapters.read(type_name, record.message(), len(layout.names), source)
-        except msg_adapters.MessageError as error:
+        except (BagError, msg_adapters.MessageError) as error:
             rejections[name] = str(error)
         else:
             if keypoints.persons:
@@ -135,15 +155,19 @@ def _bag_cameras(path: Path, keypoints: str | None, given: str | None) -> _Camer
     Cameras are read before the keypoints: some keypoints are shares of the image size, and the first of them may come
     before any CameraInfo.
     """
-    from paul_ros.offline.bag_reader import read_records
+    from paul_ros.offline.bag_reader import Recording
     from paul_ros.offline.bag_topics import choose_camera, topics_in
 
     topic = choose_camera(path, topics_in(path), given, keypoints)
     found: list[tuple[int, msg_adapters.Intrinsics]] = []
     sizes: set[tuple[int, int]] = set()
     rejections: dict[str, str] = {}
-    for record in read_records(path, [topic]) if topic else ():
-        info = record.message()
+    for record in Recording(path).whole_records([topic]) if topic else ():
+        try:
+            info = record.message()
+        except BagError as error:
+            rejections[record.topic] = str(error)
+            continue
         # An uncalibrated camera has an image size too.
         sizes.add((int(info.width), int(info.height)))
         try:

@@ -31,6 +31,7 @@ class RawFrames:
         layout: of the points.
         calibrated: W are rays, see ``TrainingData``.
         detected: (G,2,P) or None, see ``TrainingData``.
+        notes: what of the file could not be read, a sentence each.
     """
 
     W: np.ndarray
@@ -38,6 +39,7 @@ class RawFrames:
     layout: Layout
     calibrated: bool
     detected: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

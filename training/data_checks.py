@@ -65,7 +65,7 @@ def checked(raw: RawFrames, source: Path, guessed: bool) -> TrainingData:
         detected = detected if detected is None else detected[enough]
     _check_motion(W, visible, source)
     _check_twins(W, visible, layout, source)
-    notes = _notes(visible, layout, guessed)
+    notes = (*raw.notes, *_notes(visible, layout, guessed))
     return TrainingData(W, visible, layout, raw.calibrated, source.name, enough, notes, detected)
 
 

@@ -54,6 +54,7 @@ def export_model(trainer: Trainer, loss: float, path: Path, command: str) -> dic
         **({"misfit": misfit(trainer)} if recipe.scale == "free" else {}),
         "training": {
             "data": trainer.data.source,
+            "notes": list(trainer.data.notes),
             "data_sha256": trainer.data.sha256,
             "frames": len(trainer.data.W),
             "command": command,

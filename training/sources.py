@@ -65,9 +65,10 @@ def load_keypoints(options: TrainingOptions, recipe: Recipe, device: torch.devic
 
 
 def _check_folder(path: Path) -> None:
-    """Raise DataError if the path is a folder that is no bag."""
-    if path.is_dir() and not (path / "metadata.yaml").exists() and not any(path.glob("*.mcap")):
+    """Raise DataError if the path is a folder without recordings."""
+    from paul_ros.offline.bag_folder import METADATA, bag_files
+
+    if path.is_dir() and not (path / METADATA).exists() and not bag_files(path):
         raise DataError(
-            f"{path}: no .mcap file in this folder, and no motion capture (.asf with .amc, .bvh, .npz); convert other "
-            "bags with `ros2 bag convert`"
+            f"{path}: no recording in this folder (.mcap, .db3), and no motion capture (.asf with .amc, .bvh, .npz)"
         )

@@ -27,7 +27,8 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "thing",
         metavar="THING",
-        help="name of a shipped model or layout, or a path: .npz model, .yaml layout, .mcap bag or its folder",
+        help="name of a shipped model or layout, or a path: .npz model, .yaml layout, or a recording "
+        "(.mcap, .db3 or rosbag2 folder)",
     )
     add_json(parser, "the summary")
     parser.set_defaults(run=run)
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace) -> None:
     """Print the summary.
 
     Raises:
-        BagError: the bag is damaged; the summary is of what lies before the damage.
+        BagError: the bag is damaged; the summary is of the whole messages.
     """
     from paul_ros.offline.inspection import as_text, inspect
 

@@ -24,7 +24,7 @@ Lift every 2D keypoint message of a bag through the code of the node. Equal inpu
 The command prints a table of errors if the bag has a ground truth.
 """
 _EPILOG = """\
-A damaged bag is lifted up to the damage. The exit code is then 1, and also if nobody could be lifted.
+All whole messages of a damaged bag are lifted. The exit code is then 1, and also if nobody could be lifted.
 
 examples:
   paul replay recording.mcap -o lifted.mcap
@@ -41,7 +41,7 @@ def add_parser(commands: Commands) -> None:
         epilog=_EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("bag", metavar="BAG", type=Path, help=".mcap file or rosbag2 folder")
+    parser.add_argument("bag", metavar="BAG", type=Path, help="recording: .mcap or .db3 file, or rosbag2 folder")
     parser.add_argument(
         "-o",
         "--output",

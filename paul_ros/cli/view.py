@@ -34,7 +34,9 @@ def add_parser(commands: Commands) -> None:
         epilog=_EPILOG,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("thing", metavar="THING", help=".mcap file, rosbag2 folder, model file or shipped model")
+    parser.add_argument(
+        "thing", metavar="THING", help="recording (.mcap, .db3 or rosbag2 folder), model file, or shipped model"
+    )
     parser.add_argument(
         "-o",
         "--output",
@@ -64,9 +66,10 @@ def run(args: argparse.Namespace) -> None:
     """Draw the film.
 
     Raises:
-        BagError: the bag is damaged; the film shows what lies before the damage.
+        BagError: the bag is damaged; the film shows the whole messages.
     """
     from paul_ros.model_file import load_model
+    from paul_ros.offline.bag_folder import is_bag
     from paul_ros.offline.bag_topics import Topics
     from paul_ros.offline.film import view_bag
     from paul_ros.offline.film_model import view_model
@@ -75,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
     thing, damage = Path(args.thing), None
     output = args.output or Path(f"{thing.stem}.gif")
     check_files([output], [thing, args.model, args.layout])
-    if thing.is_dir() or thing.suffix in (".mcap", ".part"):
+    if is_bag(thing):
         topics = Topics(args.topic, args.camera_info_topic)
         stream = open_stream(args.model, args.layout)
         film, damage = view_bag(thing, stream, output, topics, args.start, args.seconds, drawing)

@@ -6,15 +6,13 @@ A wrong camera gives wrong metres without a word. So a choice between several is
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from msg_adapters import SUPPORTED
 from paul_ros.errors import BagError, WrongTopicError
-from paul_ros.extras import require
-from paul_ros.offline.bag_reader import matches, read_records
+from paul_ros.offline.bag_reader import matches, topics_of
 from paul_ros.wording import nearest
 
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -135,54 +133,8 @@ def choose_camera(bag: Path, held: dict[str, str], given: str | None, keypoints:
 
 
 def topics_in(bag: Path) -> dict[str, str]:
-    """Return topic -> type name of all topics with messages, in the order of their first messages as far as known.
-
-    The summary of an mcap file tells them. A bag without a summary, such as that of a killed recorder, is read whole.
-
-    Raises:
-        BagError: nothing can be read.
-    """
-    files = sorted(bag.glob("*.mcap")) if bag.is_dir() else [bag]
-    held: dict[str, str] = {}
-    for file in files:
-        with contextlib.suppress(BagError):  # a file without a message; if all are, the bag itself is read below
-            summary = _in_summary(file)
-            held.update(_in_messages(file) if summary is None else summary)
-    return held or _in_messages(bag)
-
-
-def _in_summary(file: Path) -> dict[str, str] | None:
-    """Return what the summary of an mcap file tells; None if it has no usable one."""
-    require("bags", "mcap")
-    from mcap.reader import SeekingReader
-
-    try:
-        with open(file, "rb") as stream:
-            summary = SeekingReader(stream, record_size_limit=file.stat().st_size).get_summary()
-    except Exception:  # damaged bytes surface as many errors; reading the messages names them
-        return None
-    if summary is None or summary.statistics is None:
-        return None
-    counts = summary.statistics.channel_message_counts
-    if any(count and number not in summary.channels for number, count in counts.items()):
-        return None
-    return {
-        channel.topic: summary.schemas[channel.schema_id].name
-        for number, channel in sorted(summary.channels.items())
-        if counts.get(number) and channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
-    }
-
-
-def _in_messages(bag: Path) -> dict[str, str]:
-    """Read a whole bag for its topics, up to the damage if it is damaged."""
-    held: dict[str, str] = {}
-    try:
-        for record in read_records(bag):
-            held.setdefault(record.topic, record.type_name)
-    except BagError:
-        if not held:
-            raise
-    return held
+    """Return topic -> type name of all topics with messages; raises BagError if nothing can be read."""
+    return {topic: kind for topic, (kind, count) in topics_of(bag).items() if count}
 
 
 def _keypoints(bag: Path, held: dict[str, str], given: str | None) -> str:

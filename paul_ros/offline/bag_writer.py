@@ -104,8 +104,9 @@ class BagWriter:
 
     def _add_channel(self, record: Record) -> int:
         if record.type_name not in self._schemas:
+            definition = record.definition or self._messages.known_definition(record.type_name)
             self._schemas[record.type_name] = self._writer.register_schema(
-                record.type_name, record.encoding, record.definition.encode()
+                record.type_name, record.encoding, definition.encode()
             )
         self._channels[record.topic] = self._writer.register_channel(
             record.topic, "cdr", self._schemas[record.type_name], {"offered_qos_profiles": record.qos}

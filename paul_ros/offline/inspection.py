@@ -3,31 +3,34 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
 from pathlib import Path
 
 from paul_ros.errors import BagError, InputError
 from paul_ros.layout import Layout, layout_names, load_layout
 from paul_ros.model_file import load_model, model_names
-from paul_ros.offline.bag_reader import read_records
-from paul_ros.wording import nearest
+from paul_ros.offline.bag_file import BagFile
+from paul_ros.offline.bag_folder import is_bag
+from paul_ros.offline.bag_reader import Recording
+from paul_ros.wording import nearest, quantity
 
 
 def inspect(thing: str) -> tuple[dict, BagError | None]:
     """Summarise a model, a bag or a layout.
 
     Args:
-        thing: name of a shipped model or layout, or a path: .npz model, .yaml layout, .mcap file or rosbag2 folder.
+        thing: name of a shipped model or layout, or a path: .npz model, .yaml layout, or a recording.
             A name that a model and a layout share, as `human`, gives the model's summary with the layout's in it.
 
     Returns:
-        The summary, and the error of a damaged bag, of which the messages before the damage are counted.
+        The summary, and the error of a damaged bag, whose whole messages are counted.
 
     Raises:
         BagError, LayoutError, ModelError: it cannot be read.
         InputError: there is no such file, model or layout.
     """
     path = Path(thing)
-    if path.is_dir() or path.suffix in (".mcap", ".part"):
+    if is_bag(path):
         return _bag(path)
     if thing in model_names():
         same_name = {"layout_of_this_name": _layout(load_layout(thing))} if thing in layout_names() else {}
@@ -50,30 +53,54 @@ def _unknown(name: str) -> str:
 
 
 def _bag(path: Path) -> tuple[dict, BagError | None]:
+    recording = Recording(path)
     topics: dict[str, dict] = {}
-    times: dict[str, list[int]] = {}
-    damage = None
-    try:
-        for record in read_records(path):
-            topics.setdefault(record.topic, {"type": record.type_name})
-            times.setdefault(record.topic, []).append(record.log_time)
-    except BagError as error:
-        if not topics:
-            raise
-        damage = error
-    for topic, stamps in times.items():
-        seconds = (max(stamps) - min(stamps)) / 1e9
-        topics[topic].update(messages=len(stamps), rate_hz=(len(stamps) - 1) / seconds if seconds else None)
-    everything = [stamp for stamps in times.values() for stamp in stamps]
-    seconds = (max(everything) - min(everything)) / 1e9 if everything else 0.0
+    spans: dict[str, tuple[int, int]] = {}
+    for record in recording.whole_records():
+        topic = topics.setdefault(record.topic, {"type": record.type_name, "messages": 0})
+        topic["messages"] += 1
+        spans[record.topic] = (spans.get(record.topic, (record.log_time,))[0], record.log_time)
+    damage = recording.damage
+    if damage and not topics:
+        raise damage
+    for name, topic in topics.items():
+        seconds = (spans[name][1] - spans[name][0]) / 1e9
+        topic["rate_hz"] = (topic["messages"] - 1) / seconds if seconds else None
+    first = min((begin for begin, _ in spans.values()), default=0)
+    last = max((end for _, end in spans.values()), default=0)
     return {
         "kind": "bag",
         "path": str(path),
-        "duration_s": seconds,
-        "messages": len(everything),
+        "start": _date(first) if topics else None,
+        "duration_s": (last - first) / 1e9,
+        "messages": sum(topic["messages"] for topic in topics.values()),
         "topics": topics,
+        "files": [_file(file, first) for file in recording.files],
+        "missing": [file.name for file in recording.missing],
         "damage": str(damage) if damage else None,
     }, damage
+
+
+def _file(file: BagFile, beginning: int) -> dict:
+    """Summarise a file of a recording that began at a log time, in nanoseconds."""
+    first, last = file.span or (None, None)
+    return {
+        "file": file.path.name,
+        "storage": file.storage,
+        "compression": file.compression or None,
+        "start_s": None if first is None else (first - beginning) / 1e9,
+        "end_s": None if last is None else (last - beginning) / 1e9,
+        "messages": file.messages,
+        "damage": file.damage or None,
+    }
+
+
+def _date(log_time: int) -> str:
+    """Return a log time in nanoseconds as an ISO date in UTC."""
+    try:
+        return datetime.fromtimestamp(log_time // 10**9, timezone.utc).isoformat()
+    except (OverflowError, ValueError, OSError):  # beyond the year 9999
+        return f"{log_time} ns"
 
 
 def _layout(layout: Layout) -> dict:
@@ -99,7 +126,18 @@ def as_text(summary: dict) -> str:
 
     The damage of a bag is left out, as the command ends with it as its error.
     """
-    return "\n".join(_lines({key: value for key, value in summary.items() if key != "damage"}, ""))
+    shown = {key: value for key, value in summary.items() if key != "damage"}
+    if summary["kind"] == "bag":
+        shown["files"] = {file["file"]: _file_text(file) for file in summary["files"]}
+    return "\n".join(_lines(shown, ""))
+
+
+def _file_text(file: dict) -> str:
+    times = "no times" if file["start_s"] is None else f"{file['start_s']:.1f} to {file['end_s']:.1f} s"
+    told = [times, quantity(file["messages"], "message"), file["storage"] or "unknown storage", file["compression"]]
+    if file["damage"]:
+        told.append("damaged")
+    return ", ".join(filter(None, told))
 
 
 def _lines(value: dict, indent: str) -> list[str]:
