@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from msg_adapters import ai, hri, opendr, openpose, point_cloud2, pose_array, yolo, zed
-from msg_adapters.camera_info import read_camera_info
+from msg_adapters.camera_info import image_size, read_camera_info
 from msg_adapters.depth_image import DepthImage, read_depth
 from msg_adapters.factory import MessageFactory
 from msg_adapters.keypoints import (
@@ -21,6 +21,7 @@ from msg_adapters.keypoints import (
     Source,
     WrongPointCount,
     by_name,
+    in_pinhole,
     join,
     record,
     split_persons,
@@ -85,6 +86,8 @@ __all__ = [
     "Source",
     "WrongPointCount",
     "by_name",
+    "image_size",
+    "in_pinhole",
     "join",
     "named_layout",
     "read",

@@ -19,24 +19,34 @@ from paul_ros.layout import Layout, layout_names, load_layout
 _FOCAL_LENGTHS = (10.0, 1e6)
 """Pixels, limits of plausible focal lengths; a normalised K is below them."""
 
+_LIMITS = "{:g} to {:g}".format(*_FOCAL_LENGTHS)
+
 
 class CameraInfo(Protocol):
-    """A sensor_msgs/CameraInfo of any message library: its size in pixels and its matrices d, k and p."""
+    """A sensor_msgs/CameraInfo of any message library, as far as `read_camera_info` reads it."""
 
     @property
     def width(self) -> Any: ...
     @property
     def height(self) -> Any: ...
     @property
+    def distortion_model(self) -> Any: ...
+    @property
     def d(self) -> Any: ...
     @property
     def k(self) -> Any: ...
     @property
     def p(self) -> Any: ...
+    @property
+    def binning_x(self) -> Any: ...
+    @property
+    def binning_y(self) -> Any: ...
+    @property
+    def roi(self) -> Any: ...
 
 
 Camera = Intrinsics | CameraInfo | ArrayLike
-"""A pinhole camera: intrinsics, a CameraInfo message, or a 3x3 camera matrix K in pixels."""
+"""A camera: intrinsics, a CameraInfo message, or a 3x3 camera matrix K in pixels of a rectified image."""
 
 
 def as_points(points: ArrayLike, visible: ArrayLike | None, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +86,14 @@ def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
     Raises:
         InputError: the camera is none of these, or has implausible values.
     """
-    if camera is None or isinstance(camera, Intrinsics):
+    if camera is None:
+        return None
+    if isinstance(camera, Intrinsics):
+        if not _plausible(camera.fx, camera.fy, camera.cx, camera.cy):
+            raise InputError(
+                f"camera has fx {camera.fx!r}, fy {camera.fy!r}, cx {camera.cx!r}, cy {camera.cy!r}: pass numbers "
+                f"that are finite, and focal lengths of {_LIMITS} pixels"
+            )
         return camera
     if hasattr(camera, "k") and hasattr(camera, "p"):
         try:
@@ -91,12 +108,10 @@ def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
             f"camera has shape {K.shape}: pass Intrinsics, a 3x3 camera matrix K in pixels, or a sensor_msgs/CameraInfo"
         )
     (fx, skew, cx), (zero, fy, cy), last = K.tolist()
-    low, high = _FOCAL_LENGTHS
-    plausible = low <= fx <= high and low <= fy <= high and np.isfinite([cx, cy]).all()
-    if skew or zero or last != [0, 0, 1] or not plausible:
+    if skew or zero or last != [0, 0, 1] or not _plausible(fx, fy, cx, cy):
         raise InputError(
             f"camera {K.tolist()} is no camera matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with focal lengths from "
-            f"{low:g} to {high:g} pixels: pass the K of the rectified image, not normalised, without skew"
+            f"{_LIMITS} pixels: pass the K of the rectified image, not normalised, without skew"
         )
     return Intrinsics(fx, fy, cx, cy, 0, 0, matrix="K")
 
@@ -119,6 +134,13 @@ def check_height(height: Any) -> None:
     is_number = isinstance(height, numbers.Real)
     if not (is_number and 0 <= height < math.inf):
         raise InputError(f"person_height is {height!r}: pass metres, or 0 if it is unknown")
+
+
+def _plausible(fx: Any, fy: Any, cx: Any, cy: Any) -> bool:
+    """Return whether focal lengths and principal point in pixels are numbers of a camera."""
+    low, high = _FOCAL_LENGTHS
+    are_numbers = all(isinstance(value, numbers.Real) and math.isfinite(value) for value in (fx, fy, cx, cy))
+    return are_numbers and low <= fx <= high and low <= fy <= high
 
 
 def _as_visibility(visible: ArrayLike, points: np.ndarray) -> np.ndarray:

@@ -122,8 +122,10 @@ class Lifter:
             points: (N,P,2) pixels, or (P,2) for one person; NaN, or any other value, where hidden.
             visible: (N,P), or (P,) for one person, bool; None for all points with finite coordinates. Points more than
                 a million pixels out are always hidden.
-            camera: pinhole camera of the (rectified) image, for output in metres: Intrinsics, a 3x3 camera matrix K in
-                pixels, or a sensor_msgs/CameraInfo message. None for output in model units.
+            camera: camera of the image, for output in metres; None for output in model units. It is a
+                sensor_msgs/CameraInfo message, whose distortion is corrected if the image is raw; the rule is that of
+                ``msg_adapters.read_camera_info``. If you know which image it is, pass what that function returns. Or
+                it is Intrinsics or a 3x3 camera matrix K in pixels, both of a rectified image.
             layout: layout of the points: a shipped one by name, the path of a YAML file, or a Layout. None
                 for the model's own.
 
@@ -135,21 +137,24 @@ class Lifter:
             InputError: an argument has a wrong shape, type or value.
             LayoutError: the layout does not exist, is malformed, or shares fewer than 3 points with the model's.
         """
-        if layout is None:
-            xy, seen = as_points(points, visible, self.model.layout)
-            return self.lift_in_model_layout(xy, seen, as_intrinsics(camera))
-        route = Route.between(as_layout(layout), self.model.layout)
-        xy, seen = as_points(points, visible, route.given)
+        intrinsics = as_intrinsics(camera)
+        route = Route.between(as_layout(layout), self.model.layout) if layout is not None else None
+        xy, seen = as_points(points, visible, route.given if route else self.model.layout)
+        if intrinsics and intrinsics.distortion:
+            xy = intrinsics.to_pinhole(xy)
+            seen = seen & np.isfinite(xy).all(2)
+        if route is None:
+            return self.lift_in_model_layout(xy, seen, intrinsics)
         xy, seen = route.into.values(xy), route.into.visibility(seen)
-        return route.lifted_out(self.lift_in_model_layout(xy, seen, as_intrinsics(camera)))
+        return route.lifted_out(self.lift_in_model_layout(xy, seen, intrinsics))
 
     def lift_in_model_layout(self, xy: np.ndarray, visible: np.ndarray, camera: Intrinsics | None = None) -> Lifted:
         """Lift N persons whose points are arrays in the model's own layout.
 
         Args:
-            xy: (N,P,2) pixels; any value where hidden.
+            xy: (N,P,2) pixels of the pinhole camera; any value where hidden.
             visible: (N,P) bool; points more than a million pixels out are hidden.
-            camera: intrinsics of the (rectified) image, for output in metres; None for model units.
+            camera: the pinhole camera, for output in metres; None for model units. Its distortion is ignored.
 
         Raises:
             InputError: the arrays have other shapes.

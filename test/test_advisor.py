@@ -53,13 +53,13 @@ def test_notes_are_warned_of_rarely_and_only_with_advice(advisor, clock, lines):
     ledger = Ledger()
     ledger.note("stamp_backwards")
     for _ in range(2):
-        ledger.note("distorted_image", "rectify")
+        ledger.note("image_assumed", "say which")
         advisor.report_notes(ledger)
         clock[0] += NOTE_SECONDS - 1
-    assert lines == ["noted: distorted_image, 1 so far. rectify"]
-    ledger.note("distorted_image", "rectify")
+    assert lines == ["noted: image_assumed, 1 so far. say which"]
+    ledger.note("image_assumed", "say which")
     advisor.report_notes(ledger)
-    assert lines[1:] == ["noted: distorted_image, 3 so far. rectify"]
+    assert lines[1:] == ["noted: image_assumed, 3 so far. say which"]
 
 
 def test_silence_is_warned_of_and_a_missing_publisher_named(advisor, clock, lines):

@@ -209,6 +209,8 @@ def test_a_person_that_cannot_be_lifted_is_nan_with_a_reason(lifter: Lifter) -> 
 
 def _camera(**changes: object) -> types.SimpleNamespace:
     info = {"p": [0.0] * 12, "k": [FOCAL, 0, 320, 0, FOCAL, 240, 0, 0, 1], "d": [], "width": 640, "height": 480}
+    info |= {"distortion_model": "", "binning_x": 0, "binning_y": 0}
+    info["roi"] = types.SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
     return types.SimpleNamespace(**{**info, **changes})
 
 
@@ -249,6 +251,10 @@ def test_a_layout_is_asked_for_by_name_or_path() -> None:
         ({"camera": [[600, 0, np.nan], [0, 600, 240], [0, 0, 1]]}, "no camera matrix"),
         ({"camera": np.ones((3, 4))}, r"shape \(3, 4\): pass Intrinsics, a 3x3 camera matrix K"),
         ({"camera": FOCAL}, r"shape \(\): pass Intrinsics"),
+        ({"camera": Intrinsics(-1.0, 600.0, 320.0, 240.0, 640, 480)}, "fx -1.0.*focal lengths of 10 to 1e.06"),
+        ({"camera": Intrinsics(600.0, np.nan, 320.0, 240.0, 640, 480)}, "fy nan"),
+        ({"camera": Intrinsics(600.0, 600.0, np.inf, 240.0, 640, 480)}, "cx inf"),
+        ({"camera": Intrinsics("600", 600.0, 320.0, 240.0, 640, 480)}, "fx '600'"),
         ({"camera": "camera.yaml"}, "camera of type str cannot be an array"),
         ({"camera": _camera(k=[0.0] * 9)}, "calibrate the camera"),
         ({"camera": _camera(p=[0.0])}, "no sensor_msgs/CameraInfo"),

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from msg_adapters import Intrinsics
 from paul_ros.ros.diagnostics import ERROR, OK, STALE, STALE_SECONDS, WARN, Health, percentiles
 from paul_ros.stream.stream import open_stream
 
@@ -17,7 +18,7 @@ S = 10**9  # ns
 @pytest.fixture
 def stream(model_file):
     stream = open_stream(str(model_file))
-    stream.session.intrinsics = SimpleNamespace(matrix="K", distorted=False)
+    stream.session.intrinsics = Intrinsics(600.0, 600.0, 320.0, 240.0, 640, 480)
     return stream
 
 
@@ -110,6 +111,14 @@ def test_notes_are_a_warning_as_long_as_they_are_counted(stream):
     assert report.level == WARN and report.message.startswith("another frame; hardly fit; 1 frames")
     run(health, 105.0)
     assert health.report(105.0, stream).level == OK
+
+
+@pytest.mark.parametrize("outside, level", [(1, OK), (2, WARN), (20, WARN)])
+def test_keypoints_outside_the_image_are_a_warning_if_they_are_in_some_frames(health, stream, outside, level):
+    for _ in range(10):
+        run(health)
+    stream.ledger.note("outside_image", "outside", outside)
+    assert health.report(101.0, stream).level == level
 
 
 @pytest.mark.parametrize("persons, unlike, level", [(20, 9, OK), (20, 10, OK), (20, 11, WARN), (20, 20, WARN)])

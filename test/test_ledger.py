@@ -15,7 +15,7 @@ from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.reasons import DROP, NOTE, PERSON, REASONS
 
 #: Calls whose first argument is a reason.
-CALLS = {"MessageError", "drop", "note"}
+CALLS = {"MessageError", "Note", "drop", "note"}
 
 
 def test_drops_and_notes_are_counted_with_the_latest_advice():
@@ -47,17 +47,21 @@ def sources() -> Iterator[Path]:
         yield from sorted((ROOT / package).rglob("*.py"))
 
 
-def used_reasons() -> Iterator[tuple[str, Path]]:
-    """Every reason in the sources: the literal first argument of a call that counts or raises it."""
+def called(node: ast.Call) -> str:
+    """Return the name of the called function or method."""
+    return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+
+
+def used_reasons() -> Iterator[tuple[str, Path, str]]:
+    """Every reason in the sources, its file and the call: the literal first argument of a call that counts it."""
     for path in sources():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Call) or not node.args or not isinstance(node.args[0], ast.Constant):
                 continue
-            function = node.func
-            name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+            name = called(node)
             is_super = name == "__init__" and path.name == "keypoints.py"
             if (name in CALLS or is_super) and isinstance(node.args[0].value, str):
-                yield node.args[0].value, path
+                yield node.args[0].value, path, name
 
 
 #: The lifter's own reasons become those of persons.
@@ -65,7 +69,7 @@ OF_PERSONS = {f"person_{reason}" for reason in (TOO_FEW_POINTS, DEGENERATE_POINT
 
 
 def test_the_table_has_every_reason_that_is_used_and_no_other():
-    used = dict(used_reasons())
+    used = {reason: path for reason, path, _ in used_reasons()}
     missing = {reason: str(path) for reason, path in used.items() if reason not in REASONS}
     assert not missing, f"add rows to paul_ros/stream/reasons.py: {missing}"
     unused = REASONS.keys() - used.keys() - OF_PERSONS
@@ -73,11 +77,7 @@ def test_the_table_has_every_reason_that_is_used_and_no_other():
 
 
 def test_kinds_follow_the_use():
-    noted = set()
-    for path in sources():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "note":
-                noted.add(node.args[0].value)
+    noted = {reason for reason, _, call in used_reasons() if call in ("Note", "note")}
     assert noted == {slug for slug, reason in REASONS.items() if reason.kind == NOTE}
     assert OF_PERSONS == {slug for slug, reason in REASONS.items() if reason.kind == PERSON}
     assert {reason.kind for reason in REASONS.values()} == {DROP, PERSON, NOTE}

@@ -14,13 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import CENTRE, FOCAL, persons_at, seen
+from test_camera_info import info
 
 import msg_adapters
-from msg_adapters import Source
+from msg_adapters import Source, read_camera_info
 from paul_ros import cli
 from paul_ros.layout import load_layout
+from paul_ros.lifter import Lifter
 from paul_ros.offline import keypoint_files
 from paul_ros.offline.bag_reader import read_messages
+from paul_ros.offline.camera_file import read_camera
 from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import open_stream
 
@@ -318,12 +321,49 @@ def test_a_camera_file_is_the_four_numbers(name, text, persons, model_file, tmp_
     np.testing.assert_array_equal(read(tmp_path / "a.npz")["points"], read(tmp_path / "b.npz")["points"])
 
 
-def test_distortion_without_a_rectified_image_is_noted(persons, model_file, tmp_path, capsys):
-    camera = {"K": [[FOCAL, 0, CENTRE[0]], [0, FOCAL, CENTRE[1]], [0, 0, 1]], "D": [0.1, 0, 0, 0, 0]}
+def test_the_image_of_the_keypoints_is_stated(persons, model_file, tmp_path, capsys):
+    """A calibration has two images; the distortion is corrected in the raw one only."""
+    source, results = npz(tmp_path / "in.npz", keypoints=persons), {}
+    calibration = tmp_path / "c.yaml"
+    K = f"[{FOCAL}, 0.0, {CENTRE[0]}, 0.0, {FOCAL}, {CENTRE[1]}, 0.0, 0.0, 1.0]"
+    text = CALIBRATION.replace("[1.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0]", K).replace("[0.1,", "[-0.2,")
+    old_p, new_p = f"data: [{FOCAL}, 0.0, {CENTRE[0]}, 0.0, 0.0", "data: [500, 0.0, 320, 0.0, 0.0"
+    calibration.write_text(text.replace(old_p, new_p))
+    for image in ("auto", "rectified", "raw"):
+        output = tmp_path / f"{image}.npz"
+        assert lift(source, output, model_file, "--camera", calibration, "--image", image) == 0
+        assert ("Set `image`" in capsys.readouterr().out) == (image == "auto")
+        results[image] = read(output)["points"]
+    np.testing.assert_array_equal(results["auto"], results["rectified"])
+    camera = read_camera_info(info(d=[-0.2, 0, 0, 0, 0]))
+    truth = Lifter(model_file).lift(persons[..., :2], camera=camera, layout="coco17")
+    np.testing.assert_allclose(results["raw"], truth.points, atol=1e-5)
+    assert np.abs(results["raw"] - results["rectified"]).max() > 0.02
+
+
+def test_keypoints_outside_the_image_of_the_camera_file_are_noted(persons, model_file, tmp_path, capsys):
+    camera = {"K": [FOCAL, 0, CENTRE[0], 0, FOCAL, CENTRE[1], 0, 0, 1], "width": 640, "height": 480}
     (tmp_path / "c.json").write_text(json.dumps(camera))
-    source = npz(tmp_path / "in.npz", keypoints=persons)
-    assert lift(source, tmp_path / "out.npz", model_file, "--camera", tmp_path / "c.json") == 0
-    assert "distortion but no P" in capsys.readouterr().out
+    for factor in (1, 3):
+        source = npz(tmp_path / "in.npz", keypoints=factor * persons[..., :2])
+        assert lift(source, tmp_path / f"{factor}.npz", model_file, "--camera", tmp_path / "c.json") == 0
+        assert ("CameraInfo states an image of 640x480" in capsys.readouterr().out) == (factor == 3)
+
+
+@pytest.mark.parametrize(
+    "text, size",
+    [
+        ('"width": 640, "height": 480, "binning_x": 2, "binning_y": 2', (320, 240)),
+        (
+            '"width": 640, "height": 480, "roi": {"x_offset": 40, "width": 300, "height": 200}',
+            (300, 200),
+        ),
+    ],
+)
+def test_a_camera_file_has_the_part_of_the_image(text, size, tmp_path):
+    (tmp_path / "c.json").write_text(f'{{"K": [600, 0, 320, 0, 600, 240, 0, 0, 1], {text}}}')
+    camera = read_camera(tmp_path / "c.json")
+    assert (camera.width, camera.height) == size and (camera.fx, camera.cx) in ((300, 160), (600, 280))
 
 
 @pytest.mark.parametrize(
@@ -342,6 +382,8 @@ def test_distortion_without_a_rectified_image_is_noted(persons, model_file, tmp_
         ("K: [.nan, 0, 1, 0, 1, 1, 0, 0, 1]", "not finite"),
         ("K: [1, 0, 0.5, 0, 1, 0.5, 0, 0, 1]", "calibrate the camera"),
         ("K: [900, 0, 640, 0, 900, 360, 0, 0, 1]\nwidth: wide", "not a number of pixels"),
+        ("K: [900, 0, 640, 0, 900, 360, 0, 0, 1]\nroi: all", "roi has no keys"),
+        ("K: [900, 0, 640, 0, 900, 360, 0, 0, 1]\nbinning_x: 100", "binning is 100 x 1"),
     ],
 )
 def test_a_camera_that_is_none(text, clue, persons, model_file, tmp_path, capsys):

@@ -242,7 +242,7 @@ def test_no_camera_makes_it_answer_what_float32_cannot_hold(model, focal):
     truth = standing(model, [0, 0, 5])
     camera = Intrinsics(focal, focal, 640.0, 360.0, 0, 0)
     with np.errstate(all="ignore"):
-        lifted = Lifter(model).lift(pinhole(truth), everything(truth), camera)
+        lifted = Lifter(model).lift_in_model_layout(pinhole(truth), everything(truth), camera)
     assert not lifted.ok.any() and np.isnan(lifted.points).all()
 
 

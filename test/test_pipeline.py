@@ -59,12 +59,13 @@ def test_silence_is_logged_from_the_start(ros, lifter_node, warnings):
 
 
 def test_notes_are_logged_with_what_to_do(lifter_node, warnings):
-    distorted = camera_info(MAKE)
-    distorted.d = [0.1, 0.0, 0.0, 0.0, 0.0]
+    plain, unknown = camera_info(MAKE), camera_info(MAKE)
+    unknown.d, unknown.distortion_model = [0.1], "fov"
     for count in (1, 2):
-        lifter_node.pipeline._on_camera_info(distorted)
+        for message in (plain, unknown):
+            lifter_node.pipeline._on_camera_info(message)
         lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
-        assert warnings.pop().startswith(f"noted: distorted_image, {count} so far. CameraInfo has distortion but no P")
+        assert warnings.pop().startswith(f"noted: distortion_ignored, {count} so far. CameraInfo's distortion is not")
     lifter_node.pipeline._advisor.report_notes(lifter_node.stream.ledger)
     assert not warnings
 

@@ -56,6 +56,16 @@ def test_the_image_size_stays(stream, swap, bag_make):
     assert answer.outcome is Outcome.KEPT and "no_image_size" not in other.ledger.drops
 
 
+def test_the_reach_of_keypoints_outside_the_image_stays(stream, swap):
+    stream.camera_info(camera_info(MAKE))
+    for factor, streams in ((3, stream), (2, None)):
+        xy = factor * seen(PERSONS)
+        message = outputs.keypoints_cloud(MAKE, header_of(MAKE), xy, np.ones(xy.shape[:2]), ["1", "2"])
+        (streams or swap(stream)).keypoints(CLOUD, message)
+    assert stream.ledger.notes["outside_image"] == 2
+    assert f"{3 * seen(PERSONS)[..., 0].max():.0f}x" in stream.ledger.advice["outside_image"]
+
+
 def test_the_camera_frame_stays(stream, swap):
     stream.camera_info(camera_info(MAKE))
     other = swap(stream)
@@ -108,5 +118,6 @@ def test_a_swap_that_is_refused_changes_nothing(stream):
 def test_all_that_a_session_remembers_is_tested_here():
     """A new attribute needs a test that a swap keeps it."""
     assert set(vars(Session())) == {
-        "intrinsics", "image_size", "camera_frame", "depths", "ledger", "counts", "lift_us", "_last_stamp",
+        "intrinsics", "image_size", "image", "camera_frame", "depths", "ledger", "counts", "lift_us",
+        "_last_stamp", "_camera_info", "_bounds",
     }  # fmt: skip

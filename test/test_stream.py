@@ -71,20 +71,23 @@ def test_units_follow_the_intrinsics(stream, make):
     assert_lifts(stream, make)
 
 
-def test_the_description_says_which_matrix_of_camera_info_was_used(stream, make):
+def test_the_description_says_which_matrix_and_which_image_was_taken(stream, make):
+    assert (stream.describe()["image"], stream.describe()["distortion"]) == (None, None)
     info = camera_info(make)
-    info.p = np.array([600, 0, 320, 0, 0, 600, 240, 0, 0, 0, 1.0, 0])
+    info.p = np.array([590, 0, 320, 0, 0, 600, 240, 0, 0, 0, 1.0, 0])
     info.d = array.array("d", [-0.3, 0.1, 0, 0, 0])
     stream.camera_info(info)
-    assert "CameraInfo's P" in stream.describe()["scale_source"] and not stream.ledger.notes
+    described = stream.describe()
+    assert "CameraInfo's P" in described["scale_source"] and "the rectified image" in described["scale_source"]
+    assert (described["image"], described["distortion"]) == ("rectified", "none")
+    # It is used all the same, so it is a note and not a drop.
+    assert stream.ledger.notes == {"image_assumed": 1} and not stream.ledger.drops and stream.units == "m"
     info.p = np.zeros(12)
     stream.camera_info(info)
-    assert "CameraInfo's K" in stream.describe()["scale_source"]
-    assert "raw image" in stream.describe()["scale_source"] and "P is not filled" in stream.describe()["scale_source"]
-    assert "distortion is not corrected" in stream.describe()["scale_source"]
-    # It is used all the same, so it is a note and not a drop.
-    assert stream.ledger.notes == {"distorted_image": 1} and not stream.ledger.drops and stream.units == "m"
-    assert "rectify" in stream.ledger.advice["distorted_image"]
+    described = stream.describe()
+    assert "CameraInfo's K" in described["scale_source"]
+    assert "the raw image; its distortion: plumb_bob, corrected" in described["scale_source"]
+    assert (described["image"], described["distortion"]) == ("raw", "plumb_bob, corrected")
 
 
 @pytest.mark.parametrize("kind", ["live", "bag"])

@@ -74,6 +74,8 @@ def read_bag(
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
     ((name, messages),) = frames.items()
     notes = _losses(recording, {of: why for of, why in rejections.items() if matches(of, name)})
+    if cameras.intrinsics:
+        messages = [(time, msg_adapters.in_pinhole(message, cameras.at(time))) for time, message in messages]
     xy = np.concatenate([message.xy for _, message in messages])
     visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for _, message in messages])
     if not cameras.intrinsics:
@@ -168,9 +170,9 @@ def _bag_cameras(path: Path, keypoints: str | None, given: str | None) -> _Camer
         except BagError as error:
             rejections[record.topic] = str(error)
             continue
-        # An uncalibrated camera has an image size too.
-        sizes.add((int(info.width), int(info.height)))
         try:
+            # An uncalibrated camera has an image size too.
+            sizes.add(msg_adapters.image_size(info))
             camera = msg_adapters.read_camera_info(info)
         except msg_adapters.MessageError as error:
             rejections[record.topic] = str(error)

@@ -131,13 +131,31 @@ BUILDERS: dict[str, Builder] = {
 """Type name -> builder of its messages."""
 
 
+_LENSES = (
+    ("plumb_bob", [0.0] * 5),
+    ("plumb_bob", []),
+    ("plumb_bob", [-0.3, 0.1, 0.001, -0.001, 0.02]),
+    ("plumb_bob", [0.1] * 3),
+    ("", [1e30, 0.0, 0.0, 0.0]),
+    ("rational_polynomial", [0.5, -2.6, 0.001, 0.0, 1.5, 0.4, -2.4, 1.4]),
+    ("equidistant", [-0.02, 0.01, -0.004, 0.001]),
+    ("equidistant", [-5.0, 3.0, 0.0, 0.0]),
+    ("fov", [0.9]),
+)
+"""Distortion models and their coefficients, also some that no lens has."""
+
+
 def camera_info(make: Make, rng: random.Random) -> Any:
-    """Return a CameraInfo."""
-    region = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    fx = rng.choice((600.0, 1200.0))
-    numbers = dict(k=[fx, 0.0, 320.0, 0.0, fx, 240.0, 0.0, 0.0, 1.0], r=[0.0] * 9, p=[0.0] * 12, d=[0.0] * 5)
-    arrays = {name: np.array(values) for name, values in numbers.items()}
-    size = dict(height=480, width=640, distortion_model="plumb_bob", binning_x=0, binning_y=0, roi=region)
+    """Return a CameraInfo of one of many cameras."""
+    window = rng.choice(((0, 0, 0, 0), (0, 0, 0, 0), (100, 50, 400, 300), (0, 0, 640, 480), (600, 0, 640, 480)))
+    corner = dict(zip(("x_offset", "y_offset", "width", "height"), window))
+    region = make("sensor_msgs/msg/RegionOfInterest", **corner, do_rectify=rng.random() < 0.5)
+    fx, (model, d) = rng.choice((600.0, 1200.0)), rng.choice(_LENSES)
+    p = rng.choice(([0.0] * 12, [fx, 0.0, 320.0, 0.0, 0.0, fx, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
+    numbers = dict(k=[fx, 0.0, 320.0, 0.0, fx, 240.0, 0.0, 0.0, 1.0], r=[0.0] * 9, p=p, d=d)
+    arrays = {name: np.array(values, float) for name, values in numbers.items()}
+    binning = dict(binning_x=rng.choice((0, 1, 2)), binning_y=rng.choice((0, 1, 4, 100)))
+    size = dict(height=480, width=640, distortion_model=model, **binning, roi=region)
     return make("sensor_msgs/msg/CameraInfo", header=header(make, rng, 1), **size, **arrays)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_output_layout, add_person_height
+from paul_ros.cli.options import Commands, HelpFormatter, add_image, add_model, add_output_layout, add_person_height
 from paul_ros.cli.output import STDOUT, check_files, open_output
 from paul_ros.cli.progress import progress
 from paul_ros.stream.parameters import DEFAULTS
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from msg_adapters import Intrinsics
     from paul_ros.lifter import Lifter
     from paul_ros.offline.lifted_files import Batches
+    from paul_ros.stream.session import Session
 
 FORMATS = ("npz", "csv", "json")
 
@@ -57,8 +58,8 @@ a camera, z is the line of sight to each person):
 A csv has a row for each keypoint, with root_x, root_y, root_z. In json, `persons` is a list of
 objects.
 
-The camera is that of the rectified image, as in CameraInfo. FILE is a YAML file that
-camera_calibration wrote, or JSON such as:
+--image says whether the keypoints lie in the raw or in the rectified image. FILE is a YAML file
+that camera_calibration wrote, a CameraInfo message as YAML, or JSON such as:
   {"K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], "width": 1280, "height": 720}
 
 examples:
@@ -102,6 +103,7 @@ def add_parser(commands: Commands) -> None:
         nargs=4,
         help="focal lengths and principal point in pixels",
     )
+    add_image(parser)
     add_model(parser)
     add_person_height(parser)
     parser.add_argument(
@@ -148,8 +150,11 @@ def _lift(
     from paul_ros.offline.keypoint_files import open_keypoints
     from paul_ros.offline.lifted_files import LiftedFile
     from paul_ros.route import Route, find_output_layout
+    from paul_ros.stream.session import Session
 
-    camera, model = _camera(args), lifter.model
+    camera, model, session = _camera(args), lifter.model, Session()
+    if camera:
+        session.take_camera(camera)
     units, axes = "m" if camera and lifter.metres_per_unit else "model", OPTICAL_FRAME if camera else IMAGE_AXES
     with _open_input(args.input) as file:
         layout = load_layout(args.layout) if args.layout else None
@@ -157,10 +162,10 @@ def _lift(
         keypoints = open_keypoints(file, name, kinds[0], layout, model.layout)
         output = find_output_layout(args.output_layout, model.layout)
         route = Route.between(keypoints.layout, model.layout, output)
-        lifted = lift_persons(keypoints.batches, lifter, route, camera, min_confidence)
+        lifted = lift_persons(keypoints.batches, lifter, route, session, min_confidence)
         with open_output(args.output) as out, progress("lift", "person", keypoints.persons) as count:
             LiftedFile(route.output, model, units, axes).write(out, kinds[1], _counted(lifted, tally, count))
-    return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, camera, route.given.name)])
+    return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, session, route.given.name)])
 
 
 def _counted(batches: Batches, tally: Counter[str], count: Callable[[int], None]) -> Batches:
@@ -189,15 +194,11 @@ def _reasons(tally: Counter[str]) -> str:
     return ", ".join(f"{number} {reason}" for reason, number in left_out)
 
 
-def _notes(tally: Counter[str], camera: Intrinsics | None, layout: str) -> list[str]:
+def _notes(tally: Counter[str], session: Session, layout: str) -> list[str]:
     notes = []
-    if camera is None:
+    if session.intrinsics is None:
         notes.append("note: no camera, so lengths are in model units; give --camera or --intrinsics for metres")
-    elif camera.distorted:
-        notes.append(
-            "note: the camera has distortion but no P, so K is used: positions are a little wrong unless the keypoints "
-            "are of an undistorted image"
-        )
+    notes += [f"note: {advice}" for advice in session.ledger.advice.values()]
     if tally[_UNLIKE]:
         notes.append(
             f"note: no shape of the model fits {tally[_UNLIKE]} of the persons well; if the keypoints are not in the "
@@ -221,7 +222,7 @@ def _camera(args: argparse.Namespace) -> Intrinsics | None:
     from paul_ros.offline.camera_file import camera_of, read_camera
 
     if args.camera:
-        return read_camera(args.camera)
+        return read_camera(args.camera, args.image or "auto")
     return camera_of(*args.intrinsics) if args.intrinsics else None
 
 

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 else:
     Commands = argparse._SubParsersAction
 
+IMAGES = ("auto", "rectified", "raw")
+"""Values of the parameter `image`; its table needs PyYAML, which no command may import before it runs."""
+
 PICTURES = (".png", ".svg", ".pdf")
 """Suffixes of a picture."""
 
@@ -56,6 +59,16 @@ def add_person_height(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="METRES",
         help="height of the people in metres (default: the model's mean adult)",
+    )
+
+
+def add_image(parser: argparse.ArgumentParser) -> None:
+    """Add --image, the image of the keypoints."""
+    parser.add_argument(
+        "--image",
+        choices=IMAGES,
+        help="the image that the detector saw: rectified (P of the camera), raw (K; the distortion D is corrected), "
+        "or auto: raw if D is not zero and P is empty or equals K (default: auto)",
     )
 
 

@@ -10,6 +10,7 @@ from paul_ros.cli.options import (
     PICTURES,
     Commands,
     HelpFormatter,
+    add_image,
     add_json,
     add_model,
     add_output_layout,
@@ -66,6 +67,7 @@ def add_parser(commands: Commands) -> None:
         help="cut-off frequency of the smoothing over time, as the node's parameter `smoothing` (default: off)",
     )
     add_topics(parser)
+    add_image(parser)
     parser.add_argument(
         "--depth-topic",
         metavar="TOPIC",
@@ -99,7 +101,7 @@ def run(args: argparse.Namespace) -> None:
     check_suffix(args.plot, PICTURES)
     if args.json != STDOUT:
         require("bags", "rich")
-    parameters = {name: getattr(args, name) for name in ("output_layout", "person_height", "smoothing")}
+    parameters = {name: getattr(args, name) for name in ("output_layout", "person_height", "smoothing", "image")}
     stream = open_stream(args.model, args.layout, **parameters)
     wanted = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
     topics = wanted.found_in(args.bag)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_model, add_topics, seconds
+from paul_ros.cli.options import Commands, HelpFormatter, add_image, add_model, add_topics, seconds
 from paul_ros.cli.output import check_files
 from paul_ros.cli.progress import drawing
 
@@ -59,6 +59,7 @@ def add_parser(commands: Commands) -> None:
         "--layout", help="layout of the bag's keypoints: a name or a .yaml file (default: found from the messages)"
     )
     add_topics(parser)
+    add_image(parser)
     parser.set_defaults(run=run)
 
 
@@ -80,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
     check_files([output], [thing, args.model, args.layout])
     if is_bag(thing):
         topics = Topics(args.topic, args.camera_info_topic)
-        stream = open_stream(args.model, args.layout)
+        stream = open_stream(args.model, args.layout, image=args.image)
         film, damage = view_bag(thing, stream, output, topics, args.start, args.seconds, drawing)
     else:
         film = view_model(load_model(args.thing), output, drawing)

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from msg_adapters import Intrinsics
 from msg_adapters.keypoints import Keypoints2D, record
 from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout
@@ -17,6 +16,7 @@ from paul_ros.lifted import Lifted
 from paul_ros.lifter import Lifter
 from paul_ros.route import Route
 from paul_ros.stream.layout_search import candidates
+from paul_ros.stream.session import Session
 
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 
@@ -82,7 +82,7 @@ def layout_of(points: int, model: Layout) -> Layout:
 
 
 def lift_persons(
-    batches: Iterable[Persons], lifter: Lifter, route: Route, camera: Intrinsics | None, min_confidence: float
+    batches: Iterable[Persons], lifter: Lifter, route: Route, session: Session, min_confidence: float
 ) -> Iterator[tuple[Persons, Lifted]]:
     """Lift batches of persons, one batch at a time.
 
@@ -90,7 +90,8 @@ def lift_persons(
         batches: persons in the layout `route.given`.
         lifter: lifts in the model's layout.
         route: layouts of input and output.
-        camera: intrinsics of the rectified image; None gives model units.
+        session: has the camera, whose distortion is corrected, and takes the notes; without a camera, persons are in
+            model units.
         min_confidence: keypoints below it count as hidden.
 
     Yields:
@@ -98,5 +99,5 @@ def lift_persons(
     """
     for batch in batches:
         keypoints = Keypoints2D(batch.xy, batch.confidence, batch.visible, batch.person, 0, "")
-        seen = route.keypoints_in(keypoints, min_confidence)
-        yield batch, route.lifted_out(lifter.lift_in_model_layout(seen.xy, seen.visible, camera))
+        seen = route.keypoints_in(session.in_pinhole(keypoints, min_confidence), min_confidence)
+        yield batch, route.lifted_out(lifter.lift_in_model_layout(seen.xy, seen.visible, session.intrinsics))

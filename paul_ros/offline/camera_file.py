@@ -16,17 +16,23 @@ from msg_adapters.camera_info import FOCAL_PIXELS
 from paul_ros.errors import ParameterError
 
 _MAX_BYTES = 1_000_000
+_REGION = ("x_offset", "y_offset", "width", "height")
 _CURE = (
     "name a YAML file that camera_calibration wrote, or JSON as "
     '{"K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], "width": 1280, "height": 720}'
 )
 
 
-def read_camera(path: str | Path) -> Intrinsics:
+def read_camera(path: str | Path, image: str = "auto") -> Intrinsics:
     """Read a camera from a YAML or JSON file.
 
-    The file has the keys of camera_calibration (camera_matrix, projection_matrix, distortion_coefficients, image_width,
-    image_height) or those of CameraInfo (k, p, d, width, height, in upper or lower case). P is preferred to K.
+    The file has the keys of camera_calibration (camera_matrix, projection_matrix, distortion_coefficients,
+    distortion_model, image_width, image_height) or those of CameraInfo (k, p, d, distortion_model, width, height,
+    binning_x, binning_y, roi; in upper or lower case).
+
+    Args:
+        path: of the file.
+        image: the image of the keypoints: 'rectified', 'raw' or 'auto'; see `read_camera_info`.
 
     Raises:
         ParameterError: the file is missing or describes no camera; says what to do.
@@ -38,8 +44,16 @@ def read_camera(path: str | Path) -> Intrinsics:
         raise ParameterError(f"camera file {path} has neither K (camera_matrix) nor P (projection_matrix): {_CURE}")
     d = _numbers(path, flat, ("distortion_coefficients", "d")) or []
     width, height = (_size(path, flat, keys) for keys in (("image_width", "width"), ("image_height", "height")))
+    binning = {name: _size(path, flat, (name,)) for name in ("binning_x", "binning_y")}
+    roi: Any = flat.get("roi") or {}
+    if not isinstance(roi, dict):
+        raise ParameterError(f"camera file {path}: roi has no keys: {_CURE}")
+    region = {name: _size(path, roi, (name,)) for name in _REGION}
+    model = str(flat.get("distortion_model") or "")
+    sizes = {"width": width, "height": height, **binning, "roi": SimpleNamespace(**region)}
+    message = _message(k, p, d, distortion_model=model, **sizes)
     try:
-        return _intrinsics(k, p, d, width, height)
+        return read_camera_info(message, image)
     except MessageError as error:
         raise ParameterError(f"camera file {path}: {error}") from error
 
@@ -51,7 +65,7 @@ def camera_of(fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
         ParameterError: no camera has such a focal length or principal point.
     """
     try:
-        return _intrinsics([fx, 0, cx, 0, fy, cy, 0, 0, 1], [], [], 0, 0)
+        return read_camera_info(_message([fx, 0, cx, 0, fy, cy, 0, 0, 1], [], []))
     except MessageError as error:
         shortest, longest = FOCAL_PIXELS
         for name, focal_length in (("fx", fx), ("fy", fy)):
@@ -63,9 +77,11 @@ def camera_of(fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
         raise ParameterError(f"--intrinsics: {cure}") from error
 
 
-def _intrinsics(k: Sequence[float], p: Sequence[float], d: Sequence[float], width: int, height: int) -> Intrinsics:
-    message = SimpleNamespace(k=k or [0.0] * 9, p=p or [0.0] * 12, d=d, width=width, height=height)
-    return read_camera_info(message)
+def _message(k: Sequence[float], p: Sequence[float], d: Sequence[float], **changes: Any) -> SimpleNamespace:
+    """Return a CameraInfo with these matrices; empty ones are not filled."""
+    whole = SimpleNamespace(**dict.fromkeys(_REGION, 0))
+    unset = {"width": 0, "height": 0, "distortion_model": "", "binning_x": 0, "binning_y": 0, "roi": whole}
+    return SimpleNamespace(k=k or [0.0] * 9, p=p or [0.0] * 12, d=d, **{**unset, **changes})
 
 
 def _read(path: Path) -> dict[Any, Any]:
@@ -107,8 +123,8 @@ def _numbers(path: str | Path, data: dict[str, Any], keys: tuple[str, str]) -> l
     return flat
 
 
-def _size(path: str | Path, data: dict[str, Any], keys: tuple[str, str]) -> int:
-    """Return a side of the image in pixels; 0 if the file lacks it."""
+def _size(path: str | Path, data: dict[str, Any], keys: tuple[str, ...]) -> int:
+    """Return a number of pixels, such as a side of the image; 0 if the file lacks it."""
     value = next((data[key] for key in keys if data.get(key) is not None), 0)
     if type(value) is not int or value < 0:
         raise ParameterError(f"camera file {path}: {keys[0]} is {value!r}, not a number of pixels: {_CURE}")

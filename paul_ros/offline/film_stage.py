@@ -17,7 +17,7 @@ from paul_ros.lifted import AMBIGUOUS
 from paul_ros.offline.canvas import AMBER, CALM, CAPTION, INK, Canvas, draw_legend, show_box, turntable
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.skeleton_drawing import draw_skeleton
-from paul_ros.stream.messages import project
+from paul_ros.stream.messages import image_pixels, project
 from paul_ros.wording import quantity
 
 _TURN = np.radians(3.0)  # of the turntable, a picture
@@ -118,7 +118,7 @@ class Stage:
             if reprojected is not None and frame.lifted.ok[person]:
                 colour = _REPROJECTION_COLOUR
                 draw_skeleton(ax, reprojected[person], layout.edges, colour=colour, line_width=2.4)
-            points = np.where(visible[person][:, None], frame.keypoints.xy[person], np.nan)
+            points = np.where(visible[person][:, None], image_pixels(frame.keypoints, frame.camera)[person], np.nan)
             draw_skeleton(ax, points, layout.edges, layout.sides, line_width=2.4, dot_size=14, visible=visible[person])
         show_box(ax, self.image)
 
@@ -201,7 +201,9 @@ def _room(points: np.ndarray) -> np.ndarray:
 
 def _image(done: Replay) -> np.ndarray:
     """Return least and largest pixels (2,2) of all keypoints, with a margin."""
-    seen = np.concatenate([frame.keypoints.xy[frame.keypoints.visible] for frame in done.frames])
+    seen = np.concatenate(
+        [image_pixels(frame.keypoints, frame.camera)[frame.keypoints.visible] for frame in done.frames]
+    )
     low, high = np.percentile(seen, (0.2, 99.8), axis=0)
     return np.array([low, high]) + 0.08 * np.linalg.norm(high - low) * np.array([[-1.0], [1.0]])
 

@@ -17,6 +17,7 @@ from paul_ros.offline.judge import rigid_frames
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.skeleton_drawing import draw_skeleton
 from paul_ros.offline.truth_errors import MIN_TRUTH_POINTS, match_truth
+from paul_ros.stream.messages import image_pixels
 
 _TRUTH_COLOUR = "#c4c4c4"
 _LIFTED_COLOUR, _N_MPJPE_COLOUR, _RIGID_COLOUR = "#2a9d50", "#f0a030", "#9a9a9a"
@@ -102,7 +103,10 @@ class _Row:
 
 
 def _image_row(chosen: Sequence[LiftedFrame]) -> _Row:
-    seen = [np.where(frame.keypoints.visible[..., None], frame.keypoints.xy, np.nan) for frame in chosen]
+    seen = [
+        np.where(frame.keypoints.visible[..., None], image_pixels(frame.keypoints, frame.camera), np.nan)
+        for frame in chosen
+    ]
     return _Row.of("2D input (pixels)", seen, [])
 
 

@@ -6,7 +6,8 @@ The levels, from the first that applies:
 - ERROR: the input cannot be read; or, since the last report, the node itself failed or could use no message.
 - STALE: keypoints came once, but none for STALE_SECONDS.
 - WARN: any of these was found since the last report. No keypoints came. Something was dropped. A QoS does not match.
-  The keypoints' frame is not the camera's. Most persons hardly fit the model. A CameraInfo is missing for metres.
+  The keypoints' frame is not the camera's, or they lie outside its image. Most persons hardly fit the model. A
+  CameraInfo is missing for metres.
 - OK: none of these.
 """
 
@@ -34,6 +35,10 @@ MAX_LATENCY_SECONDS = 10.0
 
 MOST_PERSONS = 0.5
 """Share of the lifted persons that must hardly fit the model before it is worth a warning."""
+
+SOME_FRAMES = 0.1
+"""Share of the frames whose keypoints must lie outside the image before it is worth a warning: persons of a resized
+image are often in the part that CameraInfo states."""
 
 _LATENCIES_KEPT = 1000  # frames, the last half minute at 30 Hz
 _NS = 1e9
@@ -141,6 +146,8 @@ class Health:
             yield stream.ledger.advice["another_frame"]
         if notes["unlike_the_model"] > MOST_PERSONS * self._persons_lifted():
             yield stream.ledger.advice["unlike_the_model"]
+        if notes["outside_image"] > SOME_FRAMES * self._frames:
+            yield stream.ledger.advice["outside_image"]
         if lacks_camera_info(stream) and self._frames:
             yield "no metres without a usable CameraInfo, remap `camera_info`"
 

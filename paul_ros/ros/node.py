@@ -24,7 +24,7 @@ from paul_ros.ros.rclpy_internals import destroy_lifecycle_publishers, lifecycle
 from paul_ros.stream.parameters import LIVE
 from paul_ros.stream.stream import LiftStream, open_stream
 
-_SWITCHING = ("model", "layout", "output_layout")
+_SWITCHING = ("model", "layout", "output_layout", "image")
 """Parameters that need another stream."""
 
 

@@ -16,6 +16,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 import msg_adapters
 from paul_ros.ros.advisor import Advisor, ThrottledLog
+from paul_ros.ros.camera_input import CameraInput
 from paul_ros.ros.diagnostics import Health, lacks_camera_info
 from paul_ros.ros.keypoint_input import KeypointInput
 from paul_ros.ros.output_topics import OutputTopics
@@ -62,6 +63,7 @@ class Pipeline:
         self._topics = OutputTopics(node, parameters, self.on_qos_mismatch)
         self._subscriptions: list[Subscription] = []
         self._timers: list[Timer] = []
+        self._camera: CameraInput | None = None
         # Not ROS time: a simulation that stands still would hold back the last image and diagnostics.
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -75,7 +77,7 @@ class Pipeline:
         self._health = Health(time.monotonic(), self.stream.ledger.drops, self.stream.ledger.notes)
         # Discovery takes its time: an absent publisher is worth a warning only after a while.
         self._log.hold("no input")
-        self._subscribe(CameraInfo, "camera_info", self._on_camera_info)
+        self._camera = CameraInput(self._node, "camera_info", self._on_camera_info, self.on_qos_mismatch)
         self._subscribe(Image, "depth", self._on_depth)
         self._group_ticks = 0
         self._group_timer = self._timer(_GROUP_SECONDS, self._on_group_tick, autostart=False)
@@ -98,7 +100,9 @@ class Pipeline:
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._input.close()
-        self._timers, self._subscriptions = [], []
+        if self._camera:
+            self._camera.close()
+        self._timers, self._subscriptions, self._camera = [], [], None
 
     def switch(self, stream: LiftStream) -> None:
         """Continue with another stream; the old one lifts what waits for the rest of its image."""
@@ -164,8 +168,13 @@ class Pipeline:
         self._advisor.report_clock_set_back(-jump.delta.nanoseconds / 1e9)
 
     def _search_input(self) -> None:
+        self._search_latched_camera()
         if self._input.try_subscribe():
             self._search_timer.cancel()
+
+    def _search_latched_camera(self) -> None:
+        if self._camera:
+            self._camera.check_publishers()
 
     def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
         events = subscription_events(self._node.resolve_topic_name(topic), self.on_qos_mismatch)
@@ -209,6 +218,7 @@ class Pipeline:
         """Publish /diagnostics and log what is wrong, once a second."""
         if not self._input.check_type():
             self._search_timer.reset()
+        self._search_latched_camera()
         input_type = self._input.type_name or "none"
         report = self._health.report(time.monotonic(), self.stream, self._input.problem, input_type)
         self._advisor.report_notes(self.stream.ledger)

@@ -22,13 +22,25 @@ def scale_source(intrinsics: Intrinsics | None, metres_per_unit: float | None) -
         return "none: the model does not know its size in metres"
     if intrinsics is None:
         return "none: no usable CameraInfo has been received"
-    image = {"P": "for the rectified image", "K": "for the raw image, because P is not filled"}[intrinsics.matrix]
-    uncorrected = "; its distortion is not corrected" if intrinsics.distorted else ""
+    image = image_of(intrinsics)
     return (
         "Size: the model's metres per unit. "
-        f"Distance: the focal length in CameraInfo's {intrinsics.matrix} ({image}{uncorrected}). "
-        "A depth image replaces both where it has a value at the root"
+        f"Distance: the focal length in CameraInfo's {intrinsics.matrix}. "
+        f"The keypoints are taken as those of the {image['image']} image; its distortion: {image['distortion']}. "
+        "A depth image replaces size and distance where it has a value at the root"
     )
+
+
+def image_of(intrinsics: Intrinsics | None) -> dict[str, str | None]:
+    """Return the image of the keypoints, 'raw' or 'rectified', and what is done about its distortion; None unknown."""
+    if intrinsics is None:
+        return {"image": None, "distortion": None}
+    distortion = "none"
+    if intrinsics.uncorrected:
+        distortion = "not corrected"
+    elif intrinsics.distortion:
+        distortion = f"{intrinsics.distortion.model}, corrected"
+    return {"image": intrinsics.image, "distortion": distortion}
 
 
 def unlike_the_model(model: str, layout: str) -> str:

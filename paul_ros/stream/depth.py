@@ -55,7 +55,7 @@ class DepthBuffer:
         Args:
             lifted: N persons.
             stamp: of their keypoints, nanoseconds.
-            camera: intrinsics of their image.
+            camera: of their image, to which the depth images are aligned.
             surface: metres from the measured surface to the root.
             ledger: notes how many depths were used and ignored, and images that cannot be used.
         """
@@ -90,4 +90,5 @@ def _measured(image: DepthImage, root: np.ndarray, camera: Intrinsics) -> float:
     if not z > 0:  # behind the camera, or not lifted
         return np.nan
     radius = max(1, round(_WINDOW * camera.fx / z))
-    return image.at(camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, radius)
+    u, v = camera.to_image(np.array((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy))).tolist()
+    return image.at(u, v, radius)

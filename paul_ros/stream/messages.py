@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_adapters import Intrinsics, outputs
+from msg_adapters import Intrinsics, Keypoints2D, outputs
 from msg_adapters.cdr import CloudWriter, PoseArrayWriter
 from msg_adapters.factory import MessageFactory
 from paul_ros.body_axes import ContinuousSigns
@@ -105,14 +105,23 @@ def _point_values(frame: Frame) -> np.ndarray:
     return outputs.point_values(*_point_columns(frame))
 
 
+def image_pixels(keypoints: Keypoints2D, camera: Intrinsics | None) -> np.ndarray:
+    """Return keypoints that the stream has undistorted as pixels (N,P,2) of their own image, raw or rectified."""
+    return keypoints.xy if camera is None else camera.to_image(keypoints.xy)
+
+
 def project(points: np.ndarray, camera: Intrinsics | None) -> np.ndarray:
-    """Project points (...,3) of the camera's frame to pixels (...,2); NaN behind the camera, or without one."""
+    """Project points (...,3) of the camera's frame to pixels (...,2) of the keypoints' image, raw or rectified.
+
+    They are NaN behind the camera, where the lens shows nothing, and without a camera.
+    """
     pixels = np.full((*points.shape[:-1], 2), np.nan)
     if camera is None:
         return pixels
     ahead = points[..., 2] > 0
     x, y, z = points[ahead].T
-    pixels[ahead] = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    pinhole = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    pixels[ahead] = camera.to_image(pinhole)
     return pixels
 
 

@@ -12,6 +12,9 @@ import yaml
 
 from paul_ros.errors import ParameterError
 
+IMAGES = ("auto", "rectified", "raw")
+"""Values of `image`; `msg_adapters.read_camera_info` has the rule of the first."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -24,6 +27,7 @@ class Parameter:
         limits: lowest and highest allowed number; None for other types.
         live: whether it may change while the node runs.
         least: lowest allowed number above 0, for numbers that 0 turns off.
+        choices: the allowed words; () for other parameters.
     """
 
     name: str
@@ -32,17 +36,22 @@ class Parameter:
     limits: tuple[float, float] | None = None
     live: bool = False
     least: float | None = None
+    choices: tuple[str, ...] = ()
 
     @property
     def range(self) -> str:
-        """The allowed numbers in words; '' without limits."""
+        """The allowed values in words; '' if any is allowed."""
+        if self.choices:
+            return " or ".join(self.choices)
         if self.limits is None:
             return ""
         low, high = self.limits
         return f"{low} to {high}" if self.least is None else f"{low:g} or {self.least} to {high}"
 
     def allows(self, value: Any) -> bool:
-        """Return whether a value is a number in range; without limits any value is allowed."""
+        """Return whether a value is one of the choices, or a number in range; without either any value is allowed."""
+        if self.choices:
+            return value in self.choices
         if self.limits is None:
             return True
         low, high = self.limits
@@ -82,6 +91,14 @@ PARAMETERS = (
         "auto",
         "Message type of `keypoints`, for example sensor_msgs/msg/PointCloud2. `auto` takes the type of the first "
         "publisher that can be read, and looks again when that publisher is gone.",
+    ),
+    Parameter(
+        "image",
+        "auto",
+        "The image that the detector sees: `rectified` (P of CameraInfo), or `raw` (K; the distortion D is corrected). "
+        "`auto` takes it as raw if D is not zero and P is empty or equals K.",
+        live=True,
+        choices=IMAGES,
     ),
     Parameter(
         "person_height",
@@ -177,7 +194,7 @@ def _literal(parameter: Parameter) -> str:
 def _changeable(parameter: Parameter) -> str:
     """Return when a parameter may be set, and its range."""
     when = "at any time" if parameter.live else "at start"
-    return f"{when}, {parameter.range}" if parameter.limits else when
+    return f"{when}, {parameter.range}" if parameter.range else when
 
 
 if __name__ == "__main__":

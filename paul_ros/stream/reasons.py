@@ -165,7 +165,7 @@ _ALL = (
     Reason(
         "bad_intrinsics",
         DROP,
-        "CameraInfo has a focal length or principal point that no camera has",
+        "CameraInfo has a focal length, principal point, roi or binning that no camera has",
         "Calibrate the camera, or correct its driver. Until then earlier intrinsics stay in use, or model units.",
     ),
     Reason(
@@ -207,10 +207,44 @@ _ALL = (
     ),
     # --- notes
     Reason(
-        "distorted_image",
+        "image_assumed",
         NOTE,
-        "CameraInfo has distortion but no P, so K is used and positions are slightly wrong",
-        "Let the camera's driver fill P, rectify the image, and detect keypoints in the rectified image.",
+        "CameraInfo has distortion and a P that differs from K, so the keypoints are taken as those of the rectified "
+        "image",
+        "Set `image` to raw if the detector sees the raw image, or to rectified to confirm.",
+    ),
+    Reason(
+        "rectified_without_p",
+        NOTE,
+        "`image` is rectified, but P of CameraInfo is not filled, so K is used",
+        "Let the camera's driver fill P, or set `image` to raw.",
+    ),
+    Reason(
+        "distortion_ignored",
+        NOTE,
+        "The image is raw, and the distortion in CameraInfo cannot be used, so it is not corrected",
+        "Calibrate the camera, or let the detector see the rectified image.",
+    ),
+    Reason(
+        "no_ray",
+        NOTE,
+        "A keypoint of the raw image lies where the camera's distortion model has no ray, or 89 degrees or more from "
+        "the optical axis, and is hidden",
+        "If it is counted for most persons, calibrate the camera with images that reach to its borders.",
+    ),
+    Reason(
+        "outside_image",
+        NOTE,
+        "Keypoints lie outside the image that CameraInfo states, as if the image was resized or is another camera's",
+        "Remap `camera_info` to that of the image that the detector sees, with the same size. Send points that the "
+        "detector guesses outside the image with a low confidence.",
+    ),
+    Reason(
+        "corner_of_image",
+        NOTE,
+        "All keypoints so far lie in the upper left quarter of the image that CameraInfo states",
+        "If the detector sees a smaller, resized image, remap `camera_info` to that of the resized image; otherwise no "
+        "action is needed.",
     ),
     Reason(
         "another_frame",

@@ -85,7 +85,7 @@ def open_stream(
     given = {"model": model, "layout": layout, **parameters}
     values = checked({name: value for name, value in given.items() if value is not None})
     loaded = load_model(values["model"])
-    return LiftStream(
+    stream = LiftStream(
         Lifter(loaded, values["person_height"]),
         load_layout(values["layout"]) if values["layout"] else None,
         values["min_confidence"],
@@ -94,6 +94,8 @@ def open_stream(
         values["smoothing"],
         session,
     )
+    stream.session.choose_image(values["image"])
+    return stream
 
 
 class LiftStream:
@@ -253,6 +255,7 @@ class LiftStream:
             "units": self.units,
             "frame": f"header.frame_id of the input; {OPTICAL_FRAME if self.intrinsics else IMAGE_AXES}",
             "scale_source": advice.scale_source(self.intrinsics, model.metres_per_unit),
+            **advice.image_of(self.intrinsics),
             "person_height": self.person_height or model.stature,
             "size_spread": self.lifter.size_spread,
             "smoothing_hz": self.smoothing,
@@ -275,7 +278,7 @@ class LiftStream:
             route = Route.between(found, self.lifter.model.layout, self._output_layout)
             if keypoints.visible.any():
                 self._known = route
-        return route.keypoints_in(keypoints, self.min_confidence)
+        return route.keypoints_in(self.session.in_pinhole(keypoints, self.min_confidence), self.min_confidence)
 
     def _check_persons(self, persons: int) -> None:
         if persons > self.max_persons:
