@@ -30,7 +30,7 @@ def read(msg: Any, points: int, _source: Source) -> Keypoints2D:
         return no_persons(points, msg.header)
     xy = np.stack([_pixels(group, points) for _, group in bodies])
     confidence = np.stack([_confidence(group, points) for _, group in bodies])
-    ids = _ids([int(target.track_id) for target, _ in bodies])
+    ids = tuple(str(int(target.track_id)) for target, _ in bodies)
     return record(xy, confidence, ids, msg.header, present=(xy != 0).any(axis=-1))
 
 
@@ -50,8 +50,3 @@ def _confidence(group: Any, points: int) -> np.ndarray:
             f"a body has {points} keypoints and {len(group.confidence)} confidences; send one for each, or none",
         )
     return np.array(group.confidence, dtype=np.float64)
-
-
-def _ids(numbers: list[int]) -> tuple[str, ...]:
-    """Return ids as text, all unknown if two are equal: a detector that does not track sends zeros."""
-    return tuple(map(str, numbers)) if len(set(numbers)) == len(numbers) else ("",) * len(numbers)

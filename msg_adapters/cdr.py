@@ -27,7 +27,7 @@ _POSE = 7  # float64: position x, y, z, orientation x, y, z, w
 _FLOAT32 = 7
 
 
-@dataclass(frozen=True)
+@dataclass
 class Time:
     """builtin_interfaces/Time."""
 
@@ -35,7 +35,7 @@ class Time:
     nanosec: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class Header:
     """std_msgs/Header."""
 

@@ -54,6 +54,28 @@ def body_array(make: MessageFactory, header: Any, positions: np.ndarray, quatern
     return make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
 
 
+def named_poses(
+    make: MessageFactory, header: Any, ids: Sequence[str], positions: np.ndarray, quaternions: np.ndarray
+) -> Any:
+    """Make a sensor_msgs/MultiDOFJointState: a name and a pose for each person.
+
+    Args:
+        make: message factory.
+        header: std_msgs/Header.
+        ids: N ids, '' = unknown.
+        positions: (N, 3).
+        quaternions: (N, 4) as x, y, z, w.
+    """
+    return make(
+        "sensor_msgs/msg/MultiDOFJointState",
+        header=header,
+        joint_names=list(ids),
+        transforms=_transforms(make, positions, quaternions),
+        twist=[],
+        wrench=[],
+    )
+
+
 def keypoints_cloud(make: MessageFactory, header: Any, xy: np.ndarray, confidence: np.ndarray, person_ids: Ids) -> Any:
     """Make the native cloud of 2D keypoints: organised, height = persons, width = keypoints.
 
@@ -154,18 +176,10 @@ def body_transforms(
         positions: (N, 3) metres.
         quaternions: (N, 4) as x, y, z, w.
     """
+    kind = "geometry_msgs/msg/TransformStamped"
     transforms = [
-        make(
-            "geometry_msgs/msg/TransformStamped",
-            header=header,
-            child_frame_id=f"body_{ident}",
-            transform=make(
-                "geometry_msgs/msg/Transform",
-                translation=_vector(make, *xyz),
-                rotation=_quaternion(make, *xyzw),
-            ),
-        )
-        for ident, xyz, xyzw in zip(ids, positions.tolist(), quaternions.tolist())
+        make(kind, header=header, child_frame_id=f"body_{ident}", transform=transform)
+        for ident, transform in zip(ids, _transforms(make, positions, quaternions))
         if ident
     ]
     return make("tf2_msgs/msg/TFMessage", transforms=transforms)
@@ -206,23 +220,18 @@ def image_annotations(
 
 
 def id_numbers(ids: Ids) -> np.ndarray:
-    """Return person ids as numbers that a float32 field can hold.
+    """Return person ids as numbers that a float32 field can hold; an array of numbers is returned as it is.
 
-    The number is -1 for ''. It is the person's row for an id that is not a whole number, or that is above 2^24: two
-    persons could share its rounded value. An array of numbers is returned as it is.
+    The number is -1, unknown, for an id that is not a whole number, and for one above 2^24: two persons could share its
+    rounded value.
     """
-    if isinstance(ids, np.ndarray):
-        return ids
-    return np.array([_id_number(str(text), row) for row, text in enumerate(ids)], dtype=np.float32)
+    return ids if isinstance(ids, np.ndarray) else np.array([_id_number(str(text)) for text in ids], np.float32)
 
 
-def _id_number(text: str, row: int) -> int:
-    if text == "":
-        return -1
-    digits = text.lstrip("0") or "0"
+def _id_number(text: str) -> int:
     # Check the length first: Python refuses to convert thousands of digits.
-    known = digits.isdecimal() and len(digits) <= len(str(_LARGEST_ID)) and int(digits) <= _LARGEST_ID
-    return int(digits) if known else row
+    known = text.isdecimal() and len(text) <= len(str(_LARGEST_ID)) and int(text) <= _LARGEST_ID
+    return int(text) if known else -1
 
 
 def _cloud(make: MessageFactory, header: Any, names: tuple[str, ...], columns: list[np.ndarray]) -> Any:
@@ -317,6 +326,14 @@ def _annotation(
 def _colour(make: MessageFactory, kind: str, colour: str, alpha: float) -> Any:
     red, green, blue = rgb(colour)
     return make(kind, r=red, g=green, b=blue, a=alpha)
+
+
+def _transforms(make: MessageFactory, positions: np.ndarray, quaternions: np.ndarray) -> list[Any]:
+    """Return a geometry_msgs/Transform for each position (N, 3) and quaternion (N, 4)."""
+    return [
+        make("geometry_msgs/msg/Transform", translation=_vector(make, *xyz), rotation=_quaternion(make, *xyzw))
+        for xyz, xyzw in zip(positions.tolist(), quaternions.tolist())
+    ]
 
 
 def _point(make: MessageFactory, xyz: Sequence[float]) -> Any:

@@ -118,12 +118,12 @@ def class_of(type_name: str) -> type:
     return type(MAKE(type_name))
 
 
-def cloud(xy: np.ndarray, **changes):
-    """Return a function header -> keypoint cloud, with some of its fields changed."""
+def cloud(xy: np.ndarray, ids=None, **changes):
+    """Return a function header -> keypoint cloud, with some of its fields changed; the ids are the rows if None."""
 
     def fill(header):
-        ids = [str(person) for person in range(len(xy))]
-        msg = outputs.keypoints_cloud(MAKE, header, xy, np.ones(xy.shape[:2]), ids)
+        rows = [str(person) for person in range(len(xy))]
+        msg = outputs.keypoints_cloud(MAKE, header, xy, np.ones(xy.shape[:2]), rows if ids is None else ids)
         for name, value in changes.items():
             setattr(msg, name, value)
         return msg

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from msg_adapters.keypoints import stamp_ns
 from paul_ros.errors import BagError, DemoError
 from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages
@@ -47,6 +48,19 @@ def test_everything_is_recorded(lived):
     counts = {topic: count for topic, (_, count) in topics_of(lived.recording).items()}
     assert {"/keypoints", "/camera_info", "/lifter/layout", "/diagnostics"} <= set(counts)
     assert counts["/lifter/poses"] == counts["/lifter/keypoints3d"] == counts["/lifter/markers"] == 60
+
+
+def test_ids_and_poses_of_persons_are_those_of_the_replay(lived, two_seconds, model_file, tmp_path):
+    replay(two_seconds, open_stream(model_file), tmp_path / "out.mcap")
+    live, replayed = (
+        {stamp_ns(message.header): message for *_, message, _ in read_messages(bag, ["/lifter/persons"])}
+        for bag in (lived.recording, tmp_path / "out.mcap")
+    )
+    assert live.keys() == replayed.keys() and {name for m in live.values() for name in m.joint_names} == {"3", "7"}
+    for stamp, message in replayed.items():
+        assert live[stamp].joint_names == message.joint_names
+        for one, other in zip(live[stamp].transforms, message.transforms, strict=True):
+            assert str(one) == str(other)
 
 
 def test_figures_of_the_node(lived):

@@ -27,10 +27,10 @@ def health():
     return Health(100.0)
 
 
-def frame(stamp: int = 0, certified=(True,), ambiguity=(0.5,)):
+def frame(stamp: int = 0, certified=(True,), ambiguity=(0.5,), stamped: bool = True):
     """The parts of a lifted frame that Health uses."""
     lifted = SimpleNamespace(certified=np.array(certified, bool), ambiguity=np.array(ambiguity, float))
-    return SimpleNamespace(keypoints=SimpleNamespace(stamp=stamp), lifted=lifted)
+    return SimpleNamespace(keypoints=SimpleNamespace(stamp=stamp), lifted=lifted, stamped=stamped)
 
 
 def run(health, now: float = 101.0) -> None:
@@ -172,6 +172,7 @@ def test_latency_is_known_if_the_clocks_agree(health, stream):
     health.published(frame(stamp=50 * S), 3 * S)  # from the future
     health.published(frame(stamp=0), 1_700_000_000 * S)  # a bag of long ago
     health.published(frame(stamp=S), 11 * S + 1)  # older than 10 s
+    health.published(frame(stamp=S, stamped=False), S + 1)  # the time of arrival
     values = health.report(101.0, stream).values
     assert values["latency_ms_median"] == values["latency_ms_p99"] == "unknown"
     for ms in range(1, 102):

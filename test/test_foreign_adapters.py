@@ -237,11 +237,6 @@ def test_ai_missing_points_and_confidences(every_make):
     assert reason_of(every_make, foreign.AI, msg) == "wrong_confidence_count"
 
 
-def test_ai_ids_that_several_persons_share_are_none(make):
-    targets = [foreign.ai_target(make, 0, body_kps=body()) for _ in range(2)]
-    assert read_of(make, foreign.AI, foreign.ai(make, header_of(make), targets)).ids == ("", "")
-
-
 def test_ai_of_nobody(make):
     assert read_of(make, foreign.AI, foreign.ai(make, header_of(make), [])).xy.shape == (0, 17, 2)
 

@@ -163,6 +163,93 @@ def test_a_bag_of_every_family_is_lifted_in_metres(tmp_path, model_file, name):
     assert (done.stream.route.given.name, done.layout.name) == (FOUND.get(name + " in", FOUND[name]), FOUND[name])
 
 
+SAME_ID = {
+    "point_cloud2": lambda make, header, xy: outputs.keypoints_cloud(make, header, xy, np.ones(xy.shape[:2]), "00"),
+    "yolo": lambda make, header, xy: with_ids(detections(make, header, xy), "detections", "id", "abc"),
+    "zed18": lambda make, header, xy: foreign.zed(make, header, poses_of(xy), 0, ids=[0, 0]),
+    "ai": lambda make, header, xy: with_ids(targets(make, header, xy), "targets", "track_id", 0),
+}
+
+
+def with_ids(message, persons: str, field: str, value):
+    for person in getattr(message, persons):
+        setattr(person, field, value)
+    return message
+
+
+@pytest.mark.parametrize("name", SAME_ID)
+def test_persons_with_one_id_in_a_bag_of_every_family_with_ids(tmp_path, model_file, name):
+    """They are lifted as persons without ids, and smoothing does not mix them."""
+    make = Factory()
+    with BagWriter(tmp_path / "in.mcap", make) as bag:
+        bag.write("/camera_info", camera_info(make), 0)
+        for number, xy in enumerate(PIXELS):
+            header = header_of(make, 1, 33_000_000 * number)
+            bag.write("/keypoints", SAME_ID[name](make, header, xy), number + 1)
+    raw, smooth = (
+        replay(tmp_path / "in.mcap", open_stream(str(model_file), smoothing=cutoff), tmp_path / "out.mcap")
+        for cutoff in (0.0, 0.5)
+    )
+    for one, other in zip(raw.frames, smooth.frames, strict=True):
+        assert one.keypoints.ids == ("", "") and one.lifted.ok.all()
+        np.testing.assert_array_equal(one.lifted.points, other.lifted.points)
+    noted = {"duplicate_ids": 2 * FRAMES}
+    assert raw.stream.ledger.notes == noted and not raw.stream.ledger.drops
+    assert smooth.stream.ledger.notes == noted | {"smoothing_without_ids": 2 * FRAMES}
+    for record in read_records(tmp_path / "out.mcap", ["/lifter/persons"]):
+        assert record.message().joint_names == ["", ""]
+
+
+def test_text_ids_keep_their_numbers_with_the_text_beside_them(tmp_path, model_file):
+    """Bodies of ROS4HRI come and go, in any order."""
+    make, images = Factory(), (("kjsdf", "anna1"), ("anna1",), ("zzzzz", "anna1"), ("anna1", "kjsdf"))
+    with BagWriter(tmp_path / "in.mcap", make) as bag:
+        bag.write("/camera_info", camera_info(make), 0)
+        for number, names in enumerate(images):
+            for name, pose in zip(names, poses_of(PIXELS[0])):
+                bag.write(BODIES.replace("*", name), foreign.hri(make, header_of(make, number + 1), pose), number + 1)
+    replay(tmp_path / "in.mcap", open_stream(str(model_file)), tmp_path / "out.mcap", Topics(keypoints=BODIES))
+    persons, clouds = (
+        [record.message() for record in read_records(tmp_path / "out.mcap", [f"/lifter/{name}"])]
+        for name in ("persons", "keypoints3d")
+    )
+    assert [tuple(message.joint_names) for message in persons] == list(images)
+    numbers = {}
+    for message, points in zip(persons, clouds, strict=True):
+        assert message.header.stamp.sec == points.header.stamp.sec
+        found = np.frombuffer(points.data, "<f4").reshape(points.height, points.width, -1)[:, 0, 5].tolist()
+        for name, number in zip(message.joint_names, found, strict=True):
+            assert numbers.setdefault(name, number) == number
+    assert sorted(numbers.values()) == [2**23, 2**23 + 1, 2**23 + 2]
+
+
+@pytest.mark.parametrize(
+    "name, with_camera", [("opendr", True), ("opendr", False), ("yolo", True), ("yolo", False), ("hri", True)]
+)
+def test_a_bag_without_stamps_and_frames(tmp_path, model_file, name, with_camera):
+    """Persons of one burst are one image at the time of its first message, in the frame of CameraInfo."""
+    make, began, count = Factory(), 1_700_000_000 * 10**9, 5
+    with BagWriter(tmp_path / "in.mcap", make) as bag:
+        if with_camera:
+            bag.write("/camera_info", camera_info(make), began - 1)
+        for number in range(count):
+            time = began + number * 33_000_000
+            for topic, message in image_messages(make, name, 0):
+                message.header.stamp.sec = message.header.stamp.nanosec = 0
+                message.header.frame_id = ""
+                bag.write(topic, message, time)
+                time += 3_000_000
+    stream = open_stream(str(model_file), smoothing=1.0)
+    done = replay(tmp_path / "in.mcap", stream, tmp_path / "out.mcap", topics_for(name))
+    assert [frame.stamp for frame in done.frames] == [began + n * 33_000_000 for n in range(count)]
+    assert all(frame.keypoints.ids == IDS[name] for frame in done.frames)
+    messages = count if name == "yolo" else 2 * count
+    assert stream.ledger.notes == {"no_stamp": messages, "no_frame": messages} and not stream.ledger.drops
+    for record in read_records(tmp_path / "out.mcap", ["/lifter/bodies", "/lifter/persons", "/lifter/poses"]):
+        assert record.message().header.frame_id == ("camera_color_optical_frame" if with_camera else "")
+        assert record.message().header.stamp.sec == 1_700_000_000
+
+
 def test_every_type_that_can_be_read_has_such_a_bag():
     bagged = {type_name for type_name, _, _ in WHOLE.values()} | {foreign.HRI, foreign.OPENDR}
     assert bagged == set(msg_adapters.SUPPORTED)
@@ -247,21 +334,38 @@ def test_persons_of_one_stamp_are_one_frame(stream, make):
     assert stream.flush() is None
 
 
-def test_without_a_stamp_every_person_is_a_frame(stream, make):
+def test_without_any_time_every_person_is_a_frame(stream, make):
     frames = [send(stream, make, ident, seconds=0, nanoseconds=0) for ident in (1, 2)]
     assert [frame.keypoints.ids for frame in frames] == [("1",), ("2",)]
     assert stream.flush() is None
 
 
-@pytest.mark.parametrize("again", [{"ident": 1}, {"ident": 2, "frame": "other_camera"}])
-def test_the_same_person_or_another_camera_begins_a_frame(stream, make, again):
+def test_another_camera_begins_a_frame(stream, make):
     send(stream, make, 1)
-    assert send(stream, make, **again).keypoints.ids == ("1",)
+    assert send(stream, make, 2, frame="other_camera").keypoints.ids == ("1",)
 
 
-def test_persons_without_ids_are_not_the_same(stream, make):
-    assert send(stream, make, -1) is None and send(stream, make, -1) is None
-    assert stream.flush().keypoints.persons == 2
+def test_a_person_that_is_sent_twice_is_one_person(stream, make):
+    assert send(stream, make, 1) is None and send(stream, make, 2) is None and send(stream, make, 1) is None
+    assert stream.flush().keypoints.ids == ("1", "2")
+    assert stream.ledger.drops == {"repeated_person": 1} and "relay" in stream.ledger.advice["repeated_person"]
+
+
+def one_of(make, place: int, ident: int, header):
+    """One OpenDR person at one of several places."""
+    (pose,) = poses_of(seen(persons_at((0.4 * place - 0.5, 0, 4))).round())
+    return foreign.opendr(make, header, pose, ident)
+
+
+@pytest.mark.parametrize("ident", [0, -1])
+def test_persons_of_one_image_without_ids_of_their_own_are_one_frame(stream, make, ident):
+    """Trackers exist that give every person id 0."""
+    for place in range(3):
+        answer = stream.keypoints(foreign.OPENDR, make.through_cdr(one_of(make, place, ident, header_of(make))))
+        assert answer.frame is None
+    frame = stream.flush()
+    assert frame.keypoints.ids == ("", "", "") and frame.person_numbers.tolist() == [-1, -1, -1]
+    assert stream.ledger.notes == ({"duplicate_ids": 3} if ident == 0 else {}) and not stream.ledger.drops
 
 
 def test_one_stamp_for_ever_does_not_gather_for_ever(stream, make):

@@ -30,6 +30,7 @@ from msg_adapters.plugins import Adapter, Adapters
 from paul_ros.errors import ModelError
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
+from paul_ros.stream.person_ids import PersonIds
 from paul_ros.stream.stream import LiftStream
 
 CASES = {"fields": 200, "junk": 100, "cdr": 200, "bags": 25, "models": 50, "layouts": 50}
@@ -66,6 +67,25 @@ def test_hypothesis_finds_nothing_either(bench, rng, kind):
     tally = Tally()
     sessions.SESSIONS[kind](bench, rng, tally, 2, kind)
     assert not tally.failures
+
+
+def test_persons_with_odd_ids_are_told_apart():
+    report = command.fuzz(200, seed=11, kinds=("ids",))
+    row = report["kinds"]["ids"]
+    assert row["failures"] == [] and row["accepted"] == report["cases"] == 200
+
+
+@pytest.mark.parametrize(
+    "fault, clue",
+    [
+        (("identified", lambda self, keypoints, ledger: keypoints), "ids"),
+        (("numbers", lambda self, ids: np.arange(len(ids), dtype=np.float32)), "number"),
+    ],
+)
+def test_persons_who_are_mixed_up_would_be_noticed(monkeypatch, fault, clue):
+    monkeypatch.setattr(PersonIds, *fault)
+    failures = command.fuzz(100, seed=11, kinds=("ids",))["kinds"]["ids"]["failures"]
+    assert any(f"WrongOutput: {clue}" in text for text in failures)
 
 
 def failing(read):

@@ -24,7 +24,7 @@ def test_messages_of_a_frame(stream, make, bag_make):  # noqa: F811
     stream.camera_info(camera_info(make))
     confidence = np.full((2, 17), 0.75)
     confidence[1, 9] = 0.1
-    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD), confidence, ["5", "anna"])).frame
+    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD), confidence, ["5", ""])).frame
     messages = MessageBuilder(make).messages(frame)
     assert tuple(messages) == STANDARD
     if make is bag_make:
@@ -38,15 +38,24 @@ def test_messages_of_a_frame(stream, make, bag_make):  # noqa: F811
     data = np.frombuffer(points.data, "<f4").reshape(2, 17, 8)
     np.testing.assert_allclose(data[..., :3], frame.lifted.points, rtol=1e-6)
     np.testing.assert_array_equal(data[..., 3], np.where(confidence > 0.3, 0.75, 0))
-    np.testing.assert_array_equal(data[:, 0, 5], [5, 1])
+    np.testing.assert_array_equal(data[:, 0, 5], [5, -1])
     assert 0.005 < markers.markers[0].scale.x < 0.05
 
 
-def test_an_id_of_thousands_of_digits_is_its_row(stream, make):  # noqa: F811
-    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD))).frame
-    frame = replace(frame, keypoints=replace(frame.keypoints, ids=("7", "1" * 5000)))
-    ids = np.frombuffer(build(frame, make, "keypoints3d").data, "<f4").reshape(2, 17, 8)[:, 0, 5]
-    np.testing.assert_array_equal(ids, [7, 1])
+def test_persons_have_the_ids_and_poses_of_the_rows_of_all_other_outputs(stream, make):  # noqa: F811
+    """A person who is not lifted has no row anywhere."""
+    stream.camera_info(camera_info(make))
+    xy = seen(persons_at((0.3, 0, 4), (1, 0, 4), (-1, 0.1, 5)))
+    xy[1, 2:] = np.nan
+    frame = stream.keypoints(CLOUD, cloud(make, xy, ids=["7", "8", ""])).frame
+    messages = MessageBuilder(make).messages(frame)
+    persons, bodies, points = messages["persons"], messages["bodies"], messages["keypoints3d"]
+    assert persons.header == bodies.header and list(persons.joint_names) == ["7", ""]
+    assert len(persons.twist) == len(persons.wrench) == 0
+    for transform, pose in zip(persons.transforms, bodies.poses, strict=True):
+        p, t = pose.position, transform.translation
+        assert (t.x, t.y, t.z) == (p.x, p.y, p.z) and transform.rotation == pose.orientation
+    assert np.frombuffer(points.data, "<f4").reshape(2, 17, 8)[:, 0, 5].tolist() == [7, -1]
 
 
 def test_ambiguity_and_distance_sigma_stand_beside_every_point(stream, make):  # noqa: F811
@@ -151,3 +160,19 @@ def test_persons_in_model_units_have_no_transforms(stream):  # noqa: F811
     stream.camera_info(camera_info(RosMake()))
     found = build(stream.keypoints(CLOUD, message).frame, make, "transforms").transforms
     assert [transform.child_frame_id for transform in found] == ["body_1", "body_2"]
+
+
+def test_transforms_need_an_id_of_ones_own_a_stamp_and_a_frame(stream, bag_make):  # noqa: F811
+    def names(received=0, ids=("1", "2"), **header):
+        frame = stream.keypoints(CLOUD, cloud(bag_make, seen(GOOD), ids=ids, **header), "", received).frame
+        (message,) = MessageBuilder(bag_make).messages(frame, ["transforms"]).values()
+        return [transform.child_frame_id for transform in message.transforms]
+
+    nameless = camera_info(bag_make)
+    nameless.header.frame_id = ""
+    stream.camera_info(nameless)
+    assert names() == ["body_1", "body_2"]
+    assert names(ids=("9", "9")) == names(frame="") == names(seconds=0, nanoseconds=0) == []
+    assert names(seconds=0, nanoseconds=0, received=10**9) == ["body_1", "body_2"]
+    stream.camera_info(camera_info(bag_make))
+    assert names(frame="", seconds=9) == ["body_1", "body_2"]

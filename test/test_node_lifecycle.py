@@ -225,7 +225,7 @@ def test_persons_that_wait_are_published_before_another_model_comes(ros, monkeyp
     monkeypatch.setattr(
         node.pipeline._topics, "publish_frame", lambda frame: models.append(node.stream.lifter.model.name)
     )
-    node.pipeline.on_keypoints(OPENDR, opendr(LiveMake(), header_of(MAKE), pose=POSES[0]), "/keypoints", 0)
+    node.pipeline.on_keypoints(OPENDR, opendr(LiveMake(), header_of(MAKE), pose=POSES[0]), "/keypoints", 0, 0)
     before = node.stream.lifter.model.name
     assert not models
     assert node.set_parameters([Parameter("model", value=str(other_model))])[0].successful

@@ -155,6 +155,37 @@ def test_transforms_and_annotations(published):
     np.testing.assert_array_equal(np.argwhere(faint), [(1, 3), (1, 4)])
 
 
+def test_transforms_are_of_persons_with_an_id_of_their_own(published):
+    """Two persons with one id, and a detector without stamp and frame."""
+    bench = published
+
+    def metres():
+        bench.camera.publish(camera_info(MAKE))
+        return bench.send(good()) and bench.units() == "m"
+
+    bench.until(metres, "metres")
+    three = seen(persons_at(*PLACES.values()))
+    stamp = bench.send(cloud(three, ["7", "5", "7"]))
+    assert list(bench.answer("persons", stamp).joint_names) == ["", "5", ""]
+    sent = time.time()
+    bench.keypoints.publish(cloud(three, ["1", "2", "3"])(header_of(MAKE, 0, 0, frame="")))
+    bench.until(lambda: any(msg.header.stamp.sec > 10**9 for msg in bench.got["persons"]), "persons without a stamp")
+    (persons,) = (msg for msg in bench.got["persons"] if msg.header.stamp.sec > 10**9)
+    assert persons.header.frame_id == "camera_color_optical_frame"
+    assert -0.1 < persons.header.stamp.sec + persons.header.stamp.nanosec / 1e9 - sent < 10
+    bench.until(lambda: "body_3" in {name for _, name in transforms_of(bench)}, "transforms")
+    assert [name for found, name in transforms_of(bench) if found == stamp] == ["body_5"]
+    named = {"body_1", "body_2", "body_3"}
+    assert {name for found, name in transforms_of(bench) if found == persons.header.stamp.sec} == named
+    values = bench.diagnosed()
+    assert [values[f"noted_{reason}"] for reason in ("duplicate_ids", "no_stamp", "no_frame")] == ["2", "1", "1"]
+
+
+def transforms_of(bench) -> list[tuple[int, str]]:
+    """Return (seconds of the stamp, name of the frame) of all transforms that came."""
+    return [(t.header.stamp.sec, t.child_frame_id) for msg in bench.got["tf"] for t in msg.transforms]
+
+
 def test_persons_without_an_id_have_no_frame_of_their_own():
     """Their order is not the same from frame to frame."""
     from types import SimpleNamespace

@@ -149,7 +149,7 @@ OPENDR_POINTS = len(load_layout("openpose18").names)
 
 def one_person(node, build, seconds: int, **person) -> None:
     msg = build(LiveMake(), header_of(MAKE, seconds), **person)
-    node.pipeline.on_keypoints(OPENDR if build is opendr else HRI, msg, "/humans/bodies/anna/skeleton2d", 0)
+    node.pipeline.on_keypoints(OPENDR if build is opendr else HRI, msg, "/humans/bodies/anna/skeleton2d", 0, 0)
 
 
 @pytest.fixture
@@ -222,6 +222,34 @@ def test_the_id_of_a_body_is_in_the_topic(lifter_node, monkeypatch):
     assert [frame.keypoints.ids for frame in published] == [("anna",)]
 
 
+def test_numbers_of_persons_outlive_a_switch_and_a_cleanup(lifter_node):
+    """A planner may still hold them."""
+    from rclpy.parameter import Parameter
+
+    who = lifter_node.stream.session.person_ids
+    (number,) = who.numbers(("anna",))
+    lifter_node.set_parameters([Parameter("output_layout", value="model")])
+    assert lifter_node.stream.session.person_ids is who
+    for trigger in ("deactivate", "cleanup", "configure", "activate"):
+        getattr(lifter_node, f"trigger_{trigger}")()
+    assert lifter_node.stream.session.person_ids.numbers(("ben", "anna"))[1] == number
+
+
+def test_without_a_stamp_the_nodes_clock_decides(lifter_node, monkeypatch):
+    """The time of arrival is the middleware's, or of the node if the middleware states none."""
+    published, before = [], time.time_ns()
+    monkeypatch.setattr(lifter_node.pipeline._topics, "publish_frame", published.append)
+    for number, received in enumerate((before - 5 * 10**9, 0)):
+        for ident, pose in enumerate(POSES, 1):
+            msg = opendr(LiveMake(), header_of(MAKE, 0, 0, frame=""), pose=pose, ident=ident)
+            lifter_node.pipeline.on_keypoints(OPENDR, msg, "/keypoints", 0, received)
+        lifter_node.pipeline.flush()
+        assert published[number].keypoints.ids == ("1", "2") and not published[number].stamped
+    assert published[0].keypoints.stamp == before - 5 * 10**9
+    assert before <= published[1].keypoints.stamp <= time.time_ns()
+    assert lifter_node.stream.ledger.notes == {"no_stamp": 4, "no_frame": 4}
+
+
 def test_the_executor_waits_once_for_a_callback(lifter_node, monkeypatch):
     """rclpy's own executor waits a second time after each."""
     import rclpy.executors
@@ -250,7 +278,7 @@ def test_bytes_that_are_no_cloud_are_a_counted_drop(lifter_node):
 
     data = serialize_message(good()(header_of(MAKE)))
     for part in (data[:40], data[:-1], b"", b"\0\1\0\0" + bytes(8) + b"\xff" * 60):
-        lifter_node.pipeline.on_keypoints(CLOUD, part, "/keypoints", 0)
+        lifter_node.pipeline.on_keypoints(CLOUD, part, "/keypoints", 0, 0)
     assert lifter_node.stream.ledger.drops == {"damaged_bytes": 4} and lifter_node.stream.counts["frames"] == 0
-    lifter_node.pipeline.on_keypoints(CLOUD, data, "/keypoints", 0)
+    lifter_node.pipeline.on_keypoints(CLOUD, data, "/keypoints", 0, 0)
     assert lifter_node.stream.counts["lifted"] == 1

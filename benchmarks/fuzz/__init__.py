@@ -9,6 +9,8 @@ A case is one message, serialised message, bag, model file or layout.  It is mad
   odd lengths and odd text.  Even a drop as `internal_error` is a crash here.
 - junk: the same with values of any type, None, nested rubbish and missing fields.  DDS cannot deliver such messages.
 - cdr: PointCloud2 as bytes, for the reader of serialised messages.  rosbags must read the same from them.
+- ids: images whose persons have odd or equal ids, from detectors that send no stamps or no frames.  An oracle knows
+  which persons belong together, and their ids, numbers and stamps.
 - bags: bits flipped, bytes cut off, inserted and exchanged, and intact bags of broken messages; read and replayed.
 - models: the file, or its contents under a correct checksum.
 - layouts: the YAML text, or the values in it.

@@ -20,7 +20,7 @@ from benchmarks.fuzz.tally import Tally
 from paul_ros.files import write_atomically
 
 #: Kind -> share of the cases.
-KINDS = {"fields": 0.40, "junk": 0.15, "cdr": 0.32, "bags": 0.05, "models": 0.05, "layouts": 0.03}
+KINDS = {"fields": 0.40, "junk": 0.15, "cdr": 0.22, "ids": 0.10, "bags": 0.05, "models": 0.05, "layouts": 0.03}
 
 
 def fuzz(

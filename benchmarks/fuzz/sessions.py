@@ -20,6 +20,7 @@ import yaml
 import msg_adapters
 from benchmarks.fuzz.bench import Bench, model_file, sealed
 from benchmarks.fuzz.breaking import break_array, break_bytes, break_fields, break_json, break_types
+from benchmarks.fuzz.identities import ids_session
 from benchmarks.fuzz.messages import BODIES, BUILDERS, camera_info, cloud, depth_image, header, random_pose
 from benchmarks.fuzz.tally import Tally, WrongOutput, persons_in
 from msg_adapters import MessageError
@@ -337,6 +338,7 @@ SESSIONS: dict[str, Session] = {
     "fields": fields_session,
     "junk": junk_session,
     "cdr": cdr_session,
+    "ids": ids_session,
     "bags": bag_session,
     "models": model_session,
     "layouts": layout_session,

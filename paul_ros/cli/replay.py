@@ -48,7 +48,7 @@ def add_parser(commands: Commands) -> None:
         "--output",
         metavar="OUT.mcap",
         type=Path,
-        help="write the lifted bag: /lifter/poses, bodies, keypoints3d, markers, layout, and the input topics",
+        help="write the lifted bag: /lifter/poses, bodies, persons, keypoints3d, markers, layout, and the input topics",
     )
     add_json(parser)
     parser.add_argument(

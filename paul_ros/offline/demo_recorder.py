@@ -27,6 +27,7 @@ RECORDED = {
     f"{NODE_NAME}/layout": "std_msgs/msg/String",
     f"{NODE_NAME}/poses": _POSES,
     f"{NODE_NAME}/bodies": _POSES,
+    f"{NODE_NAME}/persons": "sensor_msgs/msg/MultiDOFJointState",
     f"{NODE_NAME}/keypoints3d": _CLOUD,
     f"{NODE_NAME}/markers": "visualization_msgs/msg/MarkerArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",

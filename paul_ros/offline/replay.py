@@ -244,7 +244,7 @@ class _OfflineNode:
         self._decode(record, KEYPOINTS, lambda message: self._lift(record, message))
 
     def _lift(self, record: Record, message: Any) -> None:
-        answer = self.stream.keypoints(record.type_name, message, record.topic)
+        answer = self.stream.keypoints(record.type_name, message, record.topic, record.log_time)
         described = self.stream.describe()
         self._write_layout(described, record.log_time)
         if not self._layout_known and described["input_layout"]:

@@ -86,7 +86,7 @@ class Health:
         # Evaluated once a second, since a frame must not wait for that.
         self._lifted.append((frame.lifted.certified, frame.lifted.ambiguity))
         latency = (clock - frame.keypoints.stamp) / _NS
-        if 0 <= latency <= MAX_LATENCY_SECONDS:
+        if frame.stamped and 0 <= latency <= MAX_LATENCY_SECONDS:
             self._latencies.append(latency)
 
     def qos_mismatch(self) -> None:

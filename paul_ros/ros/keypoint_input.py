@@ -33,7 +33,7 @@ def readable() -> list[str]:
 class KeypointListener(Protocol):
     """The receiver of what the input gets."""
 
-    def on_keypoints(self, type_name: str, msg: Any, topic: str, missed: int) -> None:
+    def on_keypoints(self, type_name: str, msg: Any, topic: str, missed: int, received: int) -> None:
         """Take a message.
 
         Args:
@@ -41,6 +41,7 @@ class KeypointListener(Protocol):
             msg: the message; a PointCloud2 as serialised bytes.
             topic: that it came from.
             missed: number of messages before it that were lost, or were replaced while the node was busy.
+            received: system time in nanoseconds at which the middleware received it; 0 = unknown.
         """
 
     def on_no_bodies(self) -> None:
@@ -193,6 +194,6 @@ class KeypointInput:
         def on_message(msg: Any, info: Any) -> None:
             number = info["publication_sequence_number"]
             missed = numbers.missed(number, lambda: self._node.count_publishers(topic))
-            self._listener.on_keypoints(type_name, msg, topic, missed)
+            self._listener.on_keypoints(type_name, msg, topic, missed, info["received_timestamp"])
 
         return on_message

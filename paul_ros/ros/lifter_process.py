@@ -97,7 +97,7 @@ def _parse(argv: list[str]) -> None:
         prog="lifter",
         description=textwrap.fill(
             "Lift 2D keypoints to 3D. Subscribes to keypoints, camera_info and depth; publishes ~/poses, ~/bodies, "
-            "~/keypoints3d, ~/markers, ~/layout and /diagnostics.",
+            "~/persons, ~/keypoints3d, ~/markers, ~/layout and /diagnostics.",
             _HELP_COLUMNS,
         ),
         epilog="Set parameters with --ros-args -p NAME:=VALUE,\ntopics with --ros-args -r keypoints:=TOPIC.\n\n"

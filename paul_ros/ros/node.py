@@ -2,7 +2,7 @@
 """The ROS 2 node `lifter`: its life cycle and its parameters. `pipeline` has the data path.
 
 It subscribes to `keypoints` (2D), `camera_info` and `depth` (both optional). It publishes ~/poses, ~/bodies,
-~/keypoints3d, ~/markers, ~/layout and /diagnostics. Headers are the input's own.
+~/persons, ~/keypoints3d, ~/markers, ~/layout and /diagnostics. Headers are the input's own.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from paul_ros.ros.node_parameters import REFUSALS, declare
 from paul_ros.ros.pipeline import Pipeline
 from paul_ros.ros.rclpy_internals import destroy_lifecycle_publishers, lifecycle_state
 from paul_ros.stream.parameters import LIVE
+from paul_ros.stream.person_ids import PersonIds
 from paul_ros.stream.stream import LiftStream, open_stream
 
 _SWITCHING = ("model", "layout", "output_layout", "image")
@@ -51,6 +52,8 @@ class LifterNode(LifecycleNode):
         self._log = ThrottledLog(self.get_logger().warning)
         self._values = declare(self)
         self._pipeline: Pipeline | None = None
+        # Numbers of persons outlive a cleanup: listeners may still hold them.
+        self._person_ids = PersonIds()
         self._refusal: Exception | None = None
         self._starting = False
         self._final_summary = "nothing was lifted"
@@ -96,7 +99,7 @@ class LifterNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the model and make the publishers; fails, and may be repeated, if a parameter cannot be used."""
         try:
-            self._pipeline = Pipeline(self, self._values, self._log)
+            self._pipeline = Pipeline(self, self._values, self._log, self._person_ids)
         except REFUSALS as error:
             self._clean_up()
             return self._refuse(error)

@@ -22,7 +22,10 @@ from paul_ros.ros.keypoint_input import KeypointInput
 from paul_ros.ros.output_topics import OutputTopics
 from paul_ros.ros.qos import OVERRIDES, input_qos, subscription_events
 from paul_ros.stream.frame import Frame
+from paul_ros.stream.person_group import SILENCE_SECONDS
+from paul_ros.stream.person_ids import PersonIds
 from paul_ros.stream.reasons import REASONS
+from paul_ros.stream.session import Session
 from paul_ros.stream.stream import LiftStream, open_stream
 
 _SEARCH_SECONDS = 0.05
@@ -30,9 +33,6 @@ _SEARCH_SECONDS = 0.05
 
 _REPORT_SECONDS = 1.0
 """Interval of diagnostics."""
-
-_GROUP_SECONDS = 0.005
-"""Half the silence after which the persons of one image are complete: detectors send them in one burst."""
 
 
 class Pipeline:
@@ -44,19 +44,22 @@ class Pipeline:
         stream: the stream in use.
     """
 
-    def __init__(self, node: LifecycleNode, parameters: dict[str, Any], log: ThrottledLog) -> None:
+    def __init__(
+        self, node: LifecycleNode, parameters: dict[str, Any], log: ThrottledLog, person_ids: PersonIds
+    ) -> None:
         """Load the model and make the publishers.
 
         Args:
             node: owner of all publishers, subscriptions and timers.
             parameters: values by name.
             log: of warnings.
+            person_ids: who is who since the process began.
 
         Raises:
             ModelError, LayoutError, ParameterError: a parameter cannot be used.
         """
         self._node, self._log = node, log
-        self.stream = open_stream(**parameters)
+        self.stream = open_stream(**parameters, session=Session(person_ids))
         self._announced_route = self.stream.route
         self._health, self._advisor = Health(time.monotonic()), Advisor(log)
         self._input = KeypointInput(node, "keypoints", parameters["input_type"], self, log)
@@ -80,7 +83,7 @@ class Pipeline:
         self._camera = CameraInput(self._node, "camera_info", self._on_camera_info, self.on_qos_mismatch)
         self._subscribe(Image, "depth", self._on_depth)
         self._group_ticks = 0
-        self._group_timer = self._timer(_GROUP_SECONDS, self._on_group_tick, autostart=False)
+        self._group_timer = self._timer(SILENCE_SECONDS / 2, self._on_group_tick, autostart=False)
         self._search_timer = self._timer(_SEARCH_SECONDS, self._search_input)
         self._timer(_REPORT_SECONDS, self._report)
         back = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
@@ -122,11 +125,13 @@ class Pipeline:
 
     # --- inputs
 
-    def on_keypoints(self, type_name: str, msg: Any, topic: str, missed: int) -> None:
+    def on_keypoints(self, type_name: str, msg: Any, topic: str, missed: int, received: int) -> None:
         """Lift a message of keypoints; see KeypointListener."""
         self._health.received(time.monotonic())
         self.stream.ledger.drop("missed", REASONS["missed"].advice, missed)
-        self._publish(self.stream.keypoints(type_name, msg, topic).frame)
+        clock = cast(ROSClock, self._node.get_clock())
+        arrival = self._now_ns() if clock.ros_time_is_active else received or time.time_ns()
+        self._publish(self.stream.keypoints(type_name, msg, topic, arrival).frame)
         if type_name in msg_adapters.ONE_PERSON:
             self._group_ticks = 0
             self._group_timer.reset()

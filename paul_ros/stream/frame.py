@@ -20,7 +20,7 @@ class Frame:
     """The N persons of one image in 2D and 3D. P is the number of points of the output layout.
 
     Attributes:
-        header: std_msgs/Header of the input, with the camera's optical frame.
+        header: std_msgs/Header of the input, with the camera's optical frame and a usable stamp, see `Arrival`.
         keypoints: 2D in the output layout; points that were not used for lifting are hidden.
         lifted: 3D in the output layout.
         layout: the output layout.
@@ -29,6 +29,8 @@ class Frame:
         camera: intrinsics that were used; None if there were none.
         model_points: (N,Q,3) 3D points in the model's layout of Q points.
         axis_measures: (2,Q) what `left_and_up` returns for the model's layout.
+        person_numbers: (N,) float32 numbers of the persons' ids, see `PersonIds.numbers`.
+        stamped: whether the stamp is the input's own; otherwise it is the time of arrival.
     """
 
     header: Any
@@ -40,6 +42,8 @@ class Frame:
     camera: Intrinsics | None
     model_points: np.ndarray
     axis_measures: np.ndarray | None
+    person_numbers: np.ndarray
+    stamped: bool = True
 
     @functools.cached_property
     def attitudes(self) -> np.ndarray:

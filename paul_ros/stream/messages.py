@@ -65,6 +65,12 @@ def _bodies(make: MessageFactory, frame: Frame, attitudes: Attitudes) -> Any:
     return outputs.body_array(make, frame.header, frame.lifted.root[ok], attitudes()[ok])
 
 
+def _persons(make: MessageFactory, frame: Frame, attitudes: Attitudes) -> Any:
+    ok = frame.lifted.ok
+    ids = [ident for ident, good in zip(frame.keypoints.ids, ok) if good]
+    return outputs.named_poses(make, frame.header, ids, frame.lifted.root[ok], attitudes()[ok])
+
+
 def _keypoints3d(make: MessageFactory, frame: Frame, _: Attitudes) -> Any:
     return outputs.points_cloud(make, frame.header, *_point_columns(frame))
 
@@ -76,8 +82,8 @@ def _markers(make: MessageFactory, frame: Frame, _: Attitudes) -> Any:
 
 
 def _transforms(make: MessageFactory, frame: Frame, attitudes: Attitudes) -> Any:
-    # Frames are in metres (REP-103), so persons in model units have none.
-    metric = frame.metric
+    # Frames are in metres (REP-103), so persons in model units have none. Listeners of tf2 need a stamp and a parent.
+    metric = frame.metric & bool(frame.keypoints.stamp and frame.header.frame_id)
     ids = [ident for ident, good in zip(frame.keypoints.ids, metric) if good]
     return outputs.body_transforms(make, frame.header, ids, frame.lifted.root[metric], attitudes()[metric])
 
@@ -94,11 +100,10 @@ def _lifted_points(frame: Frame) -> np.ndarray:
 
 
 def _point_columns(frame: Frame) -> tuple[np.ndarray, ...]:
-    """Return points, confidence, ids, ambiguity and distance_sigma of the lifted persons."""
+    """Return points, confidence, numbers of ids, ambiguity and distance_sigma of the lifted persons."""
     lifted, ok = frame.lifted, frame.lifted.ok
-    # An id that is not a number becomes its row of the input, so rows are numbered before any is left out.
-    ids = outputs.id_numbers(frame.keypoints.ids)[ok]
-    return lifted.points[ok], frame.keypoints.confidence[ok], ids, lifted.ambiguity[ok], lifted.distance_sigma[ok]
+    numbers = frame.person_numbers[ok]
+    return lifted.points[ok], frame.keypoints.confidence[ok], numbers, lifted.ambiguity[ok], lifted.distance_sigma[ok]
 
 
 def _point_values(frame: Frame) -> np.ndarray:
@@ -128,6 +133,7 @@ def project(points: np.ndarray, camera: Intrinsics | None) -> np.ndarray:
 _TABLE = (
     Output("poses", "geometry_msgs/msg/PoseArray", _poses, "~/poses", Packed(PoseArrayWriter, _lifted_points)),
     Output("bodies", "geometry_msgs/msg/PoseArray", _bodies, "~/bodies"),
+    Output("persons", "sensor_msgs/msg/MultiDOFJointState", _persons, "~/persons"),
     Output(
         "keypoints3d",
         "sensor_msgs/msg/PointCloud2",

@@ -3,41 +3,75 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Hashable
+from dataclasses import replace
 
 import msg_adapters
-from msg_adapters import Keypoints2D
+from paul_ros.stream.arrival import Arrival
+
+SILENCE_SECONDS = 0.01
+"""Longest pause between the messages of one image: detectors send them in one burst."""
 
 
 class PersonGroup:
     """The persons of one image that have come so far, each in a message of its own.
 
-    A group closes when a person of another stamp or frame arrives, or one whose id it already has.
+    Messages with equal stamps and frames are one image. Messages without a stamp are one image while the pauses between
+    them are short. Two persons of an image may share an id, if the detector's tracker fails.
     """
 
     def __init__(self) -> None:
-        self._header: Any = None
-        self._parts: list[Keypoints2D] = []
+        self._parts: dict[Hashable, Arrival] = {}
+        self._last: Arrival | None = None
 
     def __len__(self) -> int:
         """Number of messages in the group."""
         return len(self._parts)
 
-    def accepts(self, keypoints: Keypoints2D) -> bool:
-        """Return whether these keypoints belong to the group's image; an empty group accepts any."""
-        if not self._parts:
+    def accepts(self, message: Arrival) -> bool:
+        """Return whether a message belongs to the group's image; an empty group accepts any."""
+        last = self._last
+        if last is None:
             return True
-        first = self._parts[0]
-        known = {name for part in self._parts for name in part.ids if name}
-        same = (keypoints.stamp, keypoints.frame_id) == (first.stamp, first.frame_id)
-        return same and not known.intersection(keypoints.ids)
+        new, old = message.keypoints, last.keypoints
+        prompt = abs(message.received - last.received) <= SILENCE_SECONDS * 1e9
+        if (new.frame_id, message.stamped) != (old.frame_id, last.stamped):
+            return False
+        if not message.stamped:
+            return prompt
+        # The stamp of a broken clock stands still. Then an id that comes again after a pause begins the next image.
+        return new.stamp == old.stamp and (prompt or not self._knows(new.ids))
 
-    def add(self, header: Any, keypoints: Keypoints2D) -> None:
-        """Add a person. The group's header is the last one's; stamp and frame are those of all."""
-        self._header = header
-        self._parts.append(keypoints)
+    def add(self, message: Arrival) -> bool:
+        """Add a person; return False if the message replaces an earlier one about the same person."""
+        about = _subject(message)
+        earlier = self._parts.get(about)
+        self._parts[about] = self._last = message
+        if earlier:
+            # The image keeps the time of its first message.
+            keypoints = replace(message.keypoints, stamp=earlier.keypoints.stamp)
+            self._parts[about] = replace(message, header=earlier.header, keypoints=keypoints)
+        return earlier is None
 
-    def take(self) -> tuple[Any, Keypoints2D]:
-        """Return the header and all persons in the order of arrival, and empty the group."""
-        parts, self._parts = self._parts, []
-        return self._header, msg_adapters.join(parts)
+    def take(self) -> Arrival:
+        """Return all persons in the order of arrival with the first one's header, and empty the group."""
+        parts = list(self._parts.values())
+        self._parts, self._last = {}, None
+        return replace(parts[0], keypoints=msg_adapters.join([part.keypoints for part in parts]))
+
+    def _knows(self, ids: tuple[str, ...]) -> bool:
+        known = {name for part in self._parts.values() for name in part.keypoints.ids if name}
+        return not known.isdisjoint(ids)
+
+
+def _subject(message: Arrival) -> Hashable:
+    """Return a value that two messages of one image share only if they are about one person.
+
+    Each body of ROS4HRI has a topic of its own, with its id in the name. Elsewhere only a message with equal pixels is
+    a repetition: trackers exist that give all persons one id.
+    """
+    ids = message.keypoints.ids
+    if any(name in message.topic.split("/") for name in ids if name):
+        return message.topic
+    # Persons of whom nothing is seen look alike.
+    return (ids, message.keypoints.xy.tobytes()) if message.keypoints.visible.any() else id(message)

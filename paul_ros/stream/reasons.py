@@ -150,6 +150,12 @@ _ALL = (
         "Raise the parameter `max_persons` if the number is right; otherwise check the detector.",
     ),
     Reason(
+        "repeated_person",
+        DROP,
+        "A person came twice in one image, from a detector that sends one message per person; the last is used",
+        "Check for two publishers, or a relay that sends messages twice, on the topic of the keypoints.",
+    ),
+    Reason(
         "missed",
         DROP,
         "Messages were lost on the way, or were replaced by newer ones before they could be lifted",
@@ -259,6 +265,36 @@ _ALL = (
         "The keypoints of a person hardly fit any shape of the model",
         "If many persons are counted, set `layout` (paul: `--layout`) to the layout of your detector, or train the "
         "model on more poses.",
+    ),
+    Reason(
+        "duplicate_ids",
+        NOTE,
+        "Several persons of one image have the same id, so they count as persons without an id for half a second",
+        "Turn on the detector's tracker, or choose another: persons without an id have no transform and no smoothing.",
+    ),
+    Reason(
+        "smoothing_without_ids",
+        NOTE,
+        "`smoothing` is set, and a person without an id cannot be smoothed",
+        "Remap `keypoints` to tracked keypoints, such as /yolo/tracking, or set `smoothing` to 0.",
+    ),
+    Reason(
+        "no_stamp",
+        NOTE,
+        "The keypoints have no stamp, so the time of their arrival is used",
+        "Let the detector copy the header of its image. Until then depth images and transforms are late by its delay.",
+    ),
+    Reason(
+        "invalid_stamp",
+        NOTE,
+        "A stamp that is negative, or has nanoseconds of a second or more, is replaced by the time of arrival",
+        "Correct the clock or the arithmetic of the detector.",
+    ),
+    Reason(
+        "no_frame",
+        NOTE,
+        "The keypoints have no frame_id, so CameraInfo's is used; without a CameraInfo it stays empty",
+        "Let the detector copy the header of its image, or publish CameraInfo. Transforms need a frame.",
     ),
     Reason(
         "stamp_backwards",

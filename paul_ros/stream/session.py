@@ -10,6 +10,7 @@ from msg_adapters import Intrinsics, Keypoints2D, MessageError, image_size, in_p
 from paul_ros.stream.depth import DepthBuffer
 from paul_ros.stream.image_bounds import ImageBounds
 from paul_ros.stream.ledger import Ledger
+from paul_ros.stream.person_ids import PersonIds
 from paul_ros.stream.reasons import REASONS
 
 _LIFT_TIMES_KEPT = 1000
@@ -26,17 +27,20 @@ class Session:
         image: the image of the keypoints: 'auto', 'rectified' or 'raw'; see `read_camera_info`.
         camera_frame: frame_id of the last CameraInfo; '' before the first.
         depths: the last depth images.
+        person_ids: who is who.
         ledger: counts of drops and notes.
         counts: numbers of frames, of their persons, and of the persons that were lifted.
         lift_us: the last lift times in microseconds, of frames with persons.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, person_ids: PersonIds | None = None) -> None:
+        """Begin a session; `person_ids` are those of an earlier session in this process, if there was one."""
         self.intrinsics: Intrinsics | None = None
         self.image_size: tuple[int, int] | None = None
         self.image = "auto"
         self.camera_frame = ""
         self.depths = DepthBuffer()
+        self.person_ids = person_ids or PersonIds()
         self.ledger = Ledger()
         self.counts: Counter[str] = Counter(frames=0, persons=0, lifted=0)
         self.lift_us: deque[float] = deque(maxlen=_LIFT_TIMES_KEPT)

@@ -8,7 +8,6 @@ No message stops the stream: one that cannot be used is dropped, counted by its 
 from __future__ import annotations
 
 import contextlib
-import copy
 import enum
 import logging
 import time
@@ -28,6 +27,7 @@ from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.route import Route, find_output_layout
 from paul_ros.stream import advice
+from paul_ros.stream.arrival import Arrival, complete
 from paul_ros.stream.depth import SURFACE
 from paul_ros.stream.frame import Frame
 from paul_ros.stream.layout_search import read_in_fitting_layout
@@ -101,9 +101,9 @@ def open_stream(
 class LiftStream:
     """Lifts 2D keypoint messages, one image at a time, and each on its own unless `smoothing` is set.
 
-    A message of most types is an image. If a detector sends one message per person, messages with equal stamps are
-    grouped; a group closes with the first message of another stamp, or by `flush`. To change the model or a layout,
-    open another stream with this one's session.
+    A message of most types is an image. If a detector sends one message per person, a `PersonGroup` gathers those of
+    an image; it closes with the first message of another image, or by `flush`. To change the model or a layout, open
+    another stream with this one's session.
 
     Attributes:
         session: the camera, its depth images and all counts.
@@ -202,30 +202,31 @@ class LiftStream:
         with self.guard():
             self.session.depths.add(msg_adapters.read_depth(msg))
 
-    def keypoints(self, type_name: str, msg: Any, topic: str = "") -> Answer:
+    def keypoints(self, type_name: str, msg: Any, topic: str = "", received: int = 0) -> Answer:
         """Lift one message. An image without persons is a frame too.
 
         Args:
             type_name: such as 'sensor_msgs/msg/PointCloud2'.
             msg: the message, or the serialised bytes of a PointCloud2.
             topic: topic of the message; some families have the person's id there.
+            received: nanoseconds by the clock of the stamps, for messages without a usable stamp; 0 = unknown.
         """
         with self.guard():
             if isinstance(msg, bytes):
                 msg = self._cloud_reader(msg)
             keypoints = self._read(type_name, msg, topic)
-            header = _with_frame_id(msg.header, keypoints.frame_id)
-            # Without a stamp nothing shows which persons belong to one image.
-            if type_name in msg_adapters.ONE_PERSON and keypoints.stamp:
-                return self._keep(header, keypoints)
-            return Answer(Outcome.LIFTED, self._frame(header, keypoints))
+            message = complete(msg.header, keypoints, received, topic, self.session.camera_frame, self.ledger)
+            # Without any time nothing shows which persons belong to one image.
+            if type_name in msg_adapters.ONE_PERSON and message.keypoints.stamp:
+                return self._keep(message)
+            return Answer(Outcome.LIFTED, self._frame(message))
         return Answer(Outcome.DROPPED)
 
     def flush(self) -> Frame | None:
         """Lift the persons that are kept, when no more will come; None if none are kept, or their image is dropped."""
         with self.guard():
             if len(self._group):
-                return self._frame(*self._group.take())
+                return self._frame(self._group.take())
         return None
 
     @contextlib.contextmanager
@@ -288,19 +289,21 @@ class LiftStream:
                 "that is right; otherwise check the detector.",
             )
 
-    def _keep(self, header: Any, keypoints: Keypoints2D) -> Answer:
+    def _keep(self, message: Arrival) -> Answer:
         """Keep one person; lift the previous image if this person belongs to the next."""
-        if self._group.accepts(keypoints):
-            self._check_persons(len(self._group) + keypoints.persons)
-            self._group.add(header, keypoints)
+        if self._group.accepts(message):
+            self._check_persons(len(self._group) + message.keypoints.persons)
+            if not self._group.add(message):
+                self.ledger.drop("repeated_person", REASONS["repeated_person"].advice)
             return Answer(Outcome.KEPT)
-        complete = self._group.take()
-        self._group.add(header, keypoints)
-        return Answer(Outcome.COMPLETED, self._frame(*complete))
+        image = self._group.take()
+        self._group.add(message)
+        return Answer(Outcome.COMPLETED, self._frame(image))
 
-    def _frame(self, header: Any, given: Keypoints2D) -> Frame:
+    def _frame(self, message: Arrival) -> Frame:
         """Lift the persons of one image, given in the model's layout."""
         model, route = self.lifter.model, self.route
+        given = self.session.person_ids.identified(message.keypoints, self.ledger)
         self.session.check_header(given.stamp, given.frame_id)
         lifted = self._lift(given)
         self._count(given, lifted)
@@ -312,7 +315,7 @@ class LiftStream:
         used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))
         metres_per_unit = self.lifter.metres_per_unit if lifted.units == "m" else None
         return Frame(
-            header=header,
+            header=message.header,
             keypoints=route.keypoints_out(used),
             lifted=route.lifted_out(lifted),
             layout=route.output,
@@ -321,6 +324,8 @@ class LiftStream:
             camera=self.intrinsics,
             model_points=lifted.points,
             axis_measures=self._axis_measures,
+            person_numbers=self.session.person_ids.numbers(given.ids),
+            stamped=message.stamped,
         )
 
     def _lift(self, keypoints: Keypoints2D) -> Lifted:
@@ -335,15 +340,8 @@ class LiftStream:
         self.counts.update(frames=1, persons=given.persons, lifted=int(lifted.ok.sum()))
         for reason in filter(None, lifted.reason):
             self.ledger.drop(f"person_{reason}", REASONS[f"person_{reason}"].advice)
+        if self.smoothing and (unfiltered := sum(not name for name, ok in zip(given.ids, lifted.ok) if ok)):
+            self.ledger.note("smoothing_without_ids", REASONS["smoothing_without_ids"].advice, unfiltered)
         if unlike := int((lifted.unexplained > UNLIKE_MODEL).sum()):
             text = advice.unlike_the_model(self.lifter.model.name, self.route.given.name)
             self.ledger.note("unlike_the_model", text, unlike)
-
-
-def _with_frame_id(header: Any, frame_id: str) -> Any:
-    """Return a message's header with another frame_id; the header itself if it has this one."""
-    if header.frame_id == frame_id:
-        return header
-    header = copy.copy(header)
-    header.frame_id = frame_id
-    return header
