@@ -18,15 +18,22 @@ from msg_adapters.keypoints import (
     Intrinsics,
     Keypoints2D,
     MessageError,
+    Note,
     Source,
+    UnknownLayout,
     WrongPointCount,
     by_name,
     in_pinhole,
+    is_placeholder,
     join,
     record,
+    refuse_normalised,
     split_persons,
 )
 from msg_adapters.plugins import Adapter, Adapters, OnePerson
+
+_YOLO = Adapter(yolo.read, lambda _: "coco17")
+_ZED = Adapter(zed.read, zed.layout)
 
 #: Type name -> Adapter: the shipped adapters, then those of other packages.
 SUPPORTED = Adapters(
@@ -34,9 +41,11 @@ SUPPORTED = Adapters(
         "sensor_msgs/msg/PointCloud2": Adapter(point_cloud2.read),
         "geometry_msgs/msg/PoseArray": Adapter(pose_array.read),
         # yolo_ros only numbers its points, but its pose models use COCO's order.
-        "yolo_msgs/msg/DetectionArray": Adapter(yolo.read, lambda _: "coco17"),
+        "yolo_msgs/msg/DetectionArray": _YOLO,
+        "yolov8_msgs/msg/DetectionArray": _YOLO,  # its name until yolo_ros 4
         "hri_msgs/msg/Skeleton2D": Adapter(hri.read, lambda _: "hri18", one_person=True),
-        "zed_msgs/msg/ObjectsStamped": Adapter(zed.read, zed.layout),
+        "zed_msgs/msg/ObjectsStamped": _ZED,
+        "zed_interfaces/msg/ObjectsStamped": _ZED,  # its name until zed-ros2-wrapper 5
         "ai_msgs/msg/PerceptionTargets": Adapter(ai.read),
         "opendr_interface/msg/OpenDRPose2D": Adapter(opendr.read, lambda _: "openpose18", one_person=True),
         "openpose_ros2_msgs/msg/PoseKeyPointsList": Adapter(openpose.read_list, openpose.layout_of_list),
@@ -58,7 +67,7 @@ def read(type_name: str, msg: Any, points: int, source: Source = Source()) -> Ke
         source: facts beside the message that some families need.
 
     Raises:
-        MessageError: the message cannot be used; has a reason to count by and advice.
+        MessageError: the message cannot be used; has a reason to count by and advice. Any family may raise normalised.
     """
     adapter = SUPPORTED.get(type_name)
     if adapter is None:
@@ -66,7 +75,9 @@ def read(type_name: str, msg: Any, points: int, source: Source = Source()) -> Ke
             "unknown_type",
             f"{type_name} has no adapter; publish one of {', '.join(SUPPORTED)}, or write an adapter for it",
         )
-    return adapter.read(msg, points, source)
+    keypoints = adapter.read(msg, points, source)
+    refuse_normalised(keypoints)
+    return keypoints
 
 
 def named_layout(type_name: str, msg: Any) -> str | None:
@@ -83,16 +94,20 @@ __all__ = [
     "Keypoints2D",
     "MessageError",
     "MessageFactory",
+    "Note",
     "Source",
+    "UnknownLayout",
     "WrongPointCount",
     "by_name",
     "image_size",
     "in_pinhole",
+    "is_placeholder",
     "join",
     "named_layout",
     "read",
     "read_camera_info",
     "read_depth",
     "record",
+    "refuse_normalised",
     "split_persons",
 ]

@@ -20,7 +20,7 @@ def read(msg: Any, points: int, _source: Source) -> Keypoints2D:
     """Read the targets that have body keypoints.
 
     Fields: targets[] with track_id and points[]. The points of type body_kps have point[] (x, y; z is ignored) and
-    confidence[], which may be empty. A point at (0, 0) is missing.
+    confidence[], which may be empty. A point at (0, 0) or (-1, -1) is missing.
 
     Raises:
         MessageError: wrong_point_count, wrong_confidence_count.
@@ -31,7 +31,7 @@ def read(msg: Any, points: int, _source: Source) -> Keypoints2D:
     xy = np.stack([_pixels(group, points) for _, group in bodies])
     confidence = np.stack([_confidence(group, points) for _, group in bodies])
     ids = tuple(str(int(target.track_id)) for target, _ in bodies)
-    return record(xy, confidence, ids, msg.header, present=(xy != 0).any(axis=-1))
+    return record(xy, confidence, ids, msg.header)
 
 
 def _pixels(group: Any, points: int) -> np.ndarray:

@@ -50,7 +50,8 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     _check_normalised(seen, far)
     values[far | ~seen] = np.nan
     placed = by_name(values, NAMES, source.names)[None]
-    return record(placed[..., :2] * _size(source), placed[..., 2], (_body_id(source.topic),), msg.header)
+    ids = (_body_id(source.topic),)
+    return record(placed[..., :2] * _size(source), placed[..., 2], ids, msg.header, placeholders=False)
 
 
 def _check_normalised(seen: np.ndarray, far: np.ndarray) -> None:

@@ -17,6 +17,12 @@ from msg_adapters.distortion import Distortion
 
 #: Largest plausible coordinate in pixels; points beyond it are missing.
 MAX_PIXELS = 1e6
+#: Keypoints all within this of the origin are normalised, and no pixels: detectors guess far outside 0..1 too.
+_NORMALISED = 3.0
+#: Fewest visible points that show it.
+_LEAST_POINTS = 3
+#: Detectors' peaks exceed 1 slightly; a confidence farther outside 0..1 is noted.
+CONFIDENCE_SLACK = 0.05
 
 
 class MessageError(ValueError):
@@ -43,17 +49,28 @@ class WrongPointCount(MessageError):
         self.fits = fits
 
 
-def split_persons(total: int, points: int) -> int:
-    """Return the number of persons in a flat list of `total` keypoints, `points` for each.
+class UnknownLayout(MessageError):
+    """A list of keypoints that may be one person or several, while the layout is unknown.
 
-    Raises:
-        WrongPointCount: `total` is not a multiple of `points`.
+    Attributes:
+        fits: tells if a layout with the given number of keypoints would fit.
     """
-    if total % points:
-        raise WrongPointCount(
-            f"{total} keypoints are not a multiple of the layout's {points}", lambda other: total % other == 0
-        )
-    return total // points
+
+    def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
+        super().__init__("layout_unknown", advice)
+        self.fits = fits
+
+
+class Note(NamedTuple):
+    """Something irregular about a message that was used all the same.
+
+    Attributes:
+        reason: short name to count by.
+        text: what happened and what to do, without a full stop.
+    """
+
+    reason: str
+    text: str
 
 
 @dataclass(frozen=True)
@@ -65,12 +82,34 @@ class Source:
         image_size: width and height in pixels, for families with normalised coordinates; None = unknown.
         topic: topic of the message, for families that put the person's id there; '' = unknown.
         optical_frame: frame_id of CameraInfo, for families with another frame in the header; '' = unknown.
+        candidates: numbers of points of all layouts that the message may have; () = its layout is known.
     """
 
     names: tuple[str, ...] = ()
     image_size: tuple[int, int] | None = None
     topic: str = ""
     optical_frame: str = ""
+    candidates: tuple[int, ...] = ()
+
+
+def split_persons(total: int, points: int, source: Source) -> int:
+    """Return the number of persons in a flat list of `total` keypoints, `points` for each.
+
+    While the layout is unknown, a list may only be one person: 34 keypoints are one body of 34 points or two of 17.
+
+    Raises:
+        UnknownLayout: the layout is unknown, and the list may be several persons.
+        WrongPointCount: `total` is not a multiple of `points`.
+    """
+    if any(0 < other < total and total % other == 0 for other in source.candidates):
+        raise UnknownLayout(
+            f"{total} keypoints in one list may be one body or several", lambda other: total % other == 0
+        )
+    if total % points:
+        raise WrongPointCount(
+            f"{total} keypoints are not a multiple of the layout's {points}", lambda other: total % other == 0
+        )
+    return total // points
 
 
 @dataclass(frozen=True)
@@ -84,6 +123,7 @@ class Keypoints2D:
         ids: N person ids as text, '' if unknown.
         stamp: nanoseconds, from the message's header.
         frame_id: the camera's optical frame, in nearly all families the header's frame.
+        notes: what was irregular about the message.
     """
 
     xy: np.ndarray
@@ -92,6 +132,7 @@ class Keypoints2D:
     ids: tuple[str, ...]
     stamp: int
     frame_id: str
+    notes: tuple[Note, ...] = ()
 
     @property
     def persons(self) -> int:
@@ -100,7 +141,7 @@ class Keypoints2D:
 
 
 def join(parts: list[Keypoints2D]) -> Keypoints2D:
-    """Concatenate the persons of several records of one image; stamp and frame are those of the first record."""
+    """Concatenate the persons of several records of one image; stamp, frame and notes are those of the first."""
     return Keypoints2D(
         np.concatenate([part.xy for part in parts]),
         np.concatenate([part.confidence for part in parts]),
@@ -108,19 +149,8 @@ def join(parts: list[Keypoints2D]) -> Keypoints2D:
         tuple(name for part in parts for name in part.ids),
         parts[0].stamp,
         parts[0].frame_id,
+        parts[0].notes,
     )
-
-
-class Note(NamedTuple):
-    """Something irregular in a message that was used all the same.
-
-    Attributes:
-        reason: short name to count by.
-        advice: what happened and what to do.
-    """
-
-    reason: str
-    advice: str
 
 
 @dataclass(frozen=True)
@@ -241,13 +271,42 @@ def as_float64(values: np.ndarray) -> np.ndarray:
         return np.array(values, dtype=np.float64)
 
 
+def is_placeholder(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return whether coordinates, arrays of one shape, stand for a missing point: (0, 0), (-1, -1) and the like."""
+    return (x == y) & (x <= 0)
+
+
+def refuse_normalised(keypoints: Keypoints2D) -> None:
+    """Raise MessageError if keypoints lie within 0..1: they are shares of the image's size.
+
+    Raises:
+        MessageError: normalised.
+    """
+    if (np.abs(keypoints.xy) > _NORMALISED).any() or keypoints.visible.sum() < _LEAST_POINTS:
+        return
+    xy = keypoints.xy[keypoints.visible]
+    # Points all in one place are no person in either unit.
+    if (np.ptp(xy, axis=0) > 0).all():
+        raise MessageError(
+            "normalised",
+            f"all {keypoints.visible.sum()} keypoints lie within {_NORMALISED:g} pixels of the image's corner, so they "
+            "look normalised to 0..1; multiply x by the image's width and y by its height",
+        )
+
+
 def record(
-    xy: np.ndarray, confidence: np.ndarray | None, ids: tuple[str, ...], header: Any, present: np.ndarray | None = None
+    xy: np.ndarray,
+    confidence: np.ndarray | None,
+    ids: tuple[str, ...],
+    header: Any,
+    present: np.ndarray | None = None,
+    placeholders: bool = True,
 ) -> Keypoints2D:
     """Make the record from raw arrays and mark implausible points as missing.
 
-    A point is missing if `present` is False, if x or y is not finite or beyond MAX_PIXELS, or if its confidence is
-    not finite. Confidences are clipped to 0..1: peaks of some detectors exceed one slightly.
+    A point is missing if `present` is False, or if it is a placeholder such as (0, 0) or (-1, -1). It is missing too if
+    x, y or its confidence is not finite, or if x or y is beyond MAX_PIXELS. Confidences are clipped to 0..1: peaks of some detectors
+    exceed one slightly. Confidences far outside are noted.
 
     Args:
         xy: (N, P, 2) pixels, any real type.
@@ -255,17 +314,34 @@ def record(
         ids: N person ids as text, '' if unknown.
         header: std_msgs/Header.
         present: (N, P) bool, or None if the family marks missing points by their values only.
+        placeholders: whether (0, 0), (-1, -1) and the like are missing; False if the family has a mark of its own.
     """
     xy = as_float64(xy)
     with np.errstate(invalid="ignore"):
         visible = (np.abs(xy) <= MAX_PIXELS).all(axis=-1)
+    if placeholders:
+        visible &= ~is_placeholder(xy[..., 0], xy[..., 1])
     if present is not None:
         visible &= present
+    notes: tuple[Note, ...] = ()
     if confidence is None:
-        confidence = np.ones(visible.shape)
+        confidence = visible.astype(np.float64)
     else:
-        confidence = as_float64(confidence)
-        visible &= np.isfinite(confidence)
+        given = as_float64(confidence)
+        visible &= np.isfinite(given)
+        confidence = np.where(visible, given, 0.0)
+        clipped = np.clip(confidence, 0.0, 1.0)
+        # -1 alone marks a point without confidence.
+        if ((np.abs(confidence - clipped) > CONFIDENCE_SLACK) & (confidence != -1)).any():
+            notes = (_confidence_note(confidence),)
+        confidence = clipped
     xy[~visible] = np.nan
-    confidence = np.where(visible, np.clip(confidence, 0.0, 1.0), 0.0)
-    return Keypoints2D(xy, confidence, visible, ids, stamp_ns(header), str(header.frame_id))
+    return Keypoints2D(xy, confidence, visible, ids, stamp_ns(header), str(header.frame_id), notes)
+
+
+def _confidence_note(confidence: np.ndarray) -> Note:
+    return Note(
+        "confidence_range",
+        f"confidences from {confidence.min():.4g} to {confidence.max():.4g} were clipped to 0..1, so `min_confidence` "
+        "hides other points than it says; send 0..1: divide percentages by 100, or send the sigmoid of logits",
+    )

@@ -51,4 +51,4 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
             "with the same names",
         )
     person = str(msg.pose_id) if msg.pose_id >= 0 else ""
-    return record(xy, None, (person,), msg.header, present=np.all(xy >= 0, axis=-1))
+    return record(xy, None, (person,), msg.header, present=np.all(xy >= 0, axis=-1), placeholders=False)

@@ -3,7 +3,7 @@
 
 Each point of a person has pixels and a score. The number of points tells OpenPose's order: 18 for its COCO model, 25
 for BODY_25. Such points are placed by name, so they need no layout of their own. With any other number, points have
-the layout's order. A point (0, 0, 0) is missing. Persons have no ids.
+the layout's order. A point at (0, 0) or (-1, -1) is missing. Persons have no ids.
 """
 
 from __future__ import annotations
@@ -83,8 +83,7 @@ def _read(persons: list[_Person], points: int, source: Source, header: Any) -> K
     if not persons:
         return no_persons(points, header)
     values = np.stack([_placed(person, points, source.names) for person in persons])
-    present = (values != 0).any(axis=-1)
-    return record(values[..., :2], values[..., 2], ("",) * len(persons), header, present)
+    return record(values[..., :2], values[..., 2], ("",) * len(persons), header)
 
 
 def _placed(person: _Person, points: int, names: tuple[str, ...]) -> np.ndarray:

@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from msg_adapters.keypoints import MAX_PIXELS, Keypoints2D, MessageError, Source, WrongPointCount
+from msg_adapters.keypoints import (
+    MAX_PIXELS,
+    Keypoints2D,
+    MessageError,
+    Note,
+    Source,
+    UnknownLayout,
+    WrongPointCount,
+)
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -117,6 +125,8 @@ class Plugin:
             return question(self._loaded)
         except WrongPointCount as error:
             raise WrongPointCount(str(error), functools.partial(_fits, error)) from error
+        except UnknownLayout as error:
+            raise UnknownLayout(str(error), functools.partial(_fits, error)) from error
         except MessageError as error:
             raise MessageError(str(error.reason), str(error)) from error
         except (Exception, SystemExit) as error:
@@ -162,7 +172,7 @@ def _line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _fits(error: WrongPointCount, points: int) -> bool:
+def _fits(error: WrongPointCount | UnknownLayout, points: int) -> bool:
     try:
         return bool(error.fits(points))
     except Exception:
@@ -196,4 +206,7 @@ def _checked(keypoints: object, points: int) -> Keypoints2D:
         raise ValueError("a visible point has no pixels or a confidence outside 0..1; make the result with record()")
     if not (type(keypoints.stamp) is int and all(type(name) is str for name in (*keypoints.ids, keypoints.frame_id))):
         raise TypeError("stamp must be an int, ids and frame_id text; make the result with record()")
+    notes = keypoints.notes
+    if not (type(notes) is tuple and all(isinstance(note, Note) and {*map(type, note)} == {str} for note in notes)):
+        raise TypeError("notes must be a tuple of Note(reason, text)")
     return keypoints

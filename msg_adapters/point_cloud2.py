@@ -2,12 +2,14 @@
 """sensor_msgs/PointCloud2 as 2D keypoints: the native message type.
 
 A cloud is organised (height = persons, width = keypoints) or flat (height 1, one person after the other). Fields: x, y
-in pixels, optional confidence (0 to 1), optional person_id; NaN = missing. Offsets, types, steps and byte order are
-read from the message.
+in pixels, optional confidence (0 to 1), optional person_id. NaN, (0, 0) and (-1, -1) mean missing. Without a field
+confidence, another usual name is read: score, visibility and the like. Fields that are not used are noted. Offsets,
+types, steps and byte order are read from the message.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ import numpy as np
 from msg_adapters.keypoints import (
     Keypoints2D,
     MessageError,
+    Note,
     Source,
     WrongPointCount,
     as_float64,
@@ -26,28 +29,52 @@ from msg_adapters.keypoints import (
 #: sensor_msgs/PointField datatype -> numpy type without byte order.
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
+#: Names of the field with the confidences: the contract's, then what detectors call it.
+_CONFIDENCE_NAMES = (
+    "confidence", "score", "visibility", "conf", "likelihood", "probability", "presence", "prob", "certainty", "c",
+)  # fmt: skip
 
-def read(msg: Any, points: int, _source: Source) -> Keypoints2D:
+
+def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     """Read a cloud of 2D keypoints; an empty cloud is an image without persons.
 
     Raises:
-        MessageError: wrong_fields, not_2d, wrong_steps, truncated_data, wrong_point_count.
+        MessageError: wrong_fields, not_2d, wrong_steps, truncated_data, wrong_point_count, layout_unknown.
     """
     if msg.height == 0 or msg.width == 0:
         return no_persons(points, msg.header)
     # Check sizes first: numpy cannot make a structured type with an absurd point_step.
     row_step = _row_step(msg)
-    dtype = _point_type(msg)
+    confidence_name = _confidence_name(msg)
+    dtype = _point_type(msg, confidence_name)
     cloud: np.ndarray = np.ndarray((msg.height, msg.width), dtype, buffer=msg.data, strides=(row_step, msg.point_step))
-    cloud = _persons_first(cloud, points)
+    cloud = _persons_first(cloud, points, source)
     names = dtype.names or ()
     xy = np.stack([cloud["x"], cloud["y"]], axis=-1)
-    confidence = cloud["confidence"] if "confidence" in names else None
+    confidence = cloud[confidence_name] if confidence_name else None
     ids = _ids(cloud["person_id"]) if "person_id" in names else ("",) * len(cloud)
-    return record(xy, confidence, ids, msg.header)
+    keypoints = record(xy, confidence, ids, msg.header)
+    if len(msg.fields) == len(names):
+        return keypoints
+    return replace(keypoints, notes=(*keypoints.notes, _unused(msg, names)))
 
 
-def _point_type(msg: Any) -> np.dtype:
+def _confidence_name(msg: Any) -> str | None:
+    """Return the name of the field that holds the confidences, or None."""
+    fields = {field.name for field in msg.fields}
+    return next((name for name in _CONFIDENCE_NAMES if name in fields), None)
+
+
+def _unused(msg: Any, used: tuple[str, ...]) -> Note:
+    unused = [field.name for field in msg.fields if field.name not in used]
+    return Note(
+        "unused_fields",
+        f"the fields {', '.join(unused)} of the cloud are not used, only {', '.join(used)} are; send one confidence "
+        "(0 to 1) as confidence and ids as person_id, and leave others out",
+    )
+
+
+def _point_type(msg: Any, confidence_name: str | None) -> np.dtype:
     """Return the structured type of one point with the needed fields only, at the message's offsets."""
     fields = {field.name: field for field in msg.fields}
     if "x" not in fields or "y" not in fields:
@@ -60,9 +87,9 @@ def _point_type(msg: Any) -> np.dtype:
         raise MessageError(
             "not_2d", "the cloud has a field z, so it is a 3D cloud; send 2D keypoints, x and y in pixels without z"
         )
-    wanted = [fields[name] for name in ("x", "y", "confidence", "person_id") if name in fields]
+    wanted = [fields[name] for name in ("x", "y", confidence_name, "person_id") if name in fields]
     order = ">" if msg.is_bigendian else "<"
-    formats = [order + _format(field) for field in wanted]
+    formats = [order + _format(field, confidence_name) for field in wanted]
     for field, form in zip(wanted, formats):
         if field.offset + np.dtype(form).itemsize > msg.point_step:
             raise MessageError(
@@ -80,7 +107,7 @@ def _point_type(msg: Any) -> np.dtype:
     )
 
 
-def _format(field: Any) -> str:
+def _format(field: Any, confidence_name: str | None) -> str:
     """Return the numpy type of one field. A count of 0 is read as 1: some publishers leave it unset."""
     form = _DATATYPES.get(field.datatype)
     if form is None or field.count > 1:
@@ -89,8 +116,8 @@ def _format(field: Any) -> str:
             f"field {field.name} has datatype {field.datatype} and count {field.count}; send one number of a "
             "PointField datatype 1..8",
         )
-    if field.name == "confidence" and form[0] != "f":
-        raise MessageError("wrong_fields", "field confidence is an integer; send it as float32 in 0..1")
+    if field.name == confidence_name and form[0] != "f":
+        raise MessageError("wrong_fields", f"field {field.name} is an integer; send confidence as float32 in 0..1")
     return form
 
 
@@ -115,11 +142,11 @@ def _row_step(msg: Any) -> int:
     return row_step
 
 
-def _persons_first(cloud: np.ndarray, points: int) -> np.ndarray:
+def _persons_first(cloud: np.ndarray, points: int, source: Source) -> np.ndarray:
     """Return the (height, width) cloud as (persons, points)."""
     height, width = cloud.shape
     if height == 1:
-        return cloud.reshape(split_persons(width, points), points)
+        return cloud.reshape(split_persons(width, points, source), points)
     if width != points:
         raise WrongPointCount(
             f"the cloud has {width} keypoints per person (its width), the layout {points}", lambda other: other == width

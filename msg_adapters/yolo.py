@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""yolo_msgs/DetectionArray (yolo_ros): pixels, ids if tracking is on.
+"""yolo_msgs/DetectionArray (yolo_ros; once yolov8_msgs): pixels, ids if tracking is on.
 
 A detection's keypoint list is sparse and its ids count from 1. Points are placed by id, never by position in the list.
-A point at exactly (0, 0) is missing.
+A point at exactly (0, 0) or (-1, -1) is missing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def read(msg: Any, points: int, _source: Source) -> Keypoints2D:
             xy[person, column] = keypoint.point.x, keypoint.point.y
             confidence[person, column] = keypoint.score
     ids = tuple(str(detection.id) for detection in msg.detections)
-    return record(xy, confidence, ids, msg.header, present=(xy != 0).any(axis=-1))
+    return record(xy, confidence, ids, msg.header)
 
 
 def _column(keypoint_id: int, points: int) -> int:

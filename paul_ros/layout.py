@@ -174,6 +174,10 @@ class Layout:
             )
         return Mapping(self, target, sources)
 
+    def fits(self, target: Layout) -> bool:
+        """Return whether the layout maps onto another one."""
+        return sum(map(bool, self._sources(target))) >= MIN_POINTS
+
     def point_names(self, points: tuple[int, ...]) -> list[str]:
         """Return the names of points by index."""
         return [self.names[index] for index in points]
@@ -250,9 +254,6 @@ class Mapping:
                 f"layout '{self.source.name}' needs xy (N,{expected[1]},2), confidence and visible "
                 f"(N,{expected[1]}), got {xy.shape}, {confidence.shape}, {visible.shape}"
             )
-
-
-# --- shipped layouts, and those of users
 
 
 def layout_names() -> tuple[str, ...]:
@@ -345,6 +346,5 @@ def _read_yaml(path: Path) -> object:
 
 def _layouts_onto(target: Layout) -> str:
     """Return the names of the shipped layouts that map onto the target, as text for an error."""
-    shipped = (load_layout(name) for name in layout_names())
-    names = [layout.name for layout in shipped if sum(map(bool, layout._sources(target))) >= MIN_POINTS]
+    names = [name for name in layout_names() if load_layout(name).fits(target)]
     return ", ".join(names) or "none of the shipped ones; name its points as one of them does"

@@ -20,6 +20,8 @@ _FOCAL_LENGTHS = (10.0, 1e6)
 """Pixels, limits of plausible focal lengths; a normalised K is below them."""
 
 _LIMITS = "{:g} to {:g}".format(*_FOCAL_LENGTHS)
+HEIGHTS = (0.3, 3.0)
+"""Metres, limits of the heights of persons, as of the parameter person_height; centimetres are above them."""
 
 
 class CameraInfo(Protocol):
@@ -129,11 +131,11 @@ def check_height(height: Any) -> None:
     """Check a height of persons in metres; 0 is an unknown height.
 
     Raises:
-        InputError: the height is no number, negative or not finite.
+        InputError: the height is no number, or no person's in metres.
     """
-    is_number = isinstance(height, numbers.Real)
-    if not (is_number and 0 <= height < math.inf):
-        raise InputError(f"person_height is {height!r}: pass metres, or 0 if it is unknown")
+    low, high = HEIGHTS
+    if not (isinstance(height, numbers.Real) and (height == 0 or low <= float(height) <= high)):
+        raise InputError(f"person_height is {height!r}: pass metres, from {low:g} to {high:g}, or 0 if it is unknown")
 
 
 def _plausible(fx: Any, fy: Any, cx: Any, cy: Any) -> bool:
@@ -174,7 +176,8 @@ def _advice(xy: np.ndarray, layout: Layout) -> str:
         return ": pass x and y as points[..., :2], and confidences as visible=points[..., 2] > 0.3"
     if xy.shape[1:] == (2, P):
         return ": transpose them"
-    fitting = [name for name in layout_names() if (len(load_layout(name).names), 2) == xy.shape[1:]]
+    shipped = map(load_layout, layout_names())
+    fitting = [other.name for other in shipped if (len(other.names), 2) == xy.shape[1:] and other.fits(layout)]
     if not fitting:
         return ""
     return f": name their layout, as in layout='{fitting[0]}'; these have so many points: {', '.join(fitting)}"

@@ -170,7 +170,10 @@ class Lifter:
         return "m" if camera and self.metres_per_unit else "model"
 
     def _checked(self, xy: np.ndarray, visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        xy, visible = np.asarray(xy, float), np.asarray(visible, bool)
+        try:
+            xy, visible = np.asarray(xy, float), np.asarray(visible, bool)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"xy and visible must be arrays of numbers: {error}") from None
         P = len(self.model.layout.names)
         if xy.ndim != 3 or xy.shape[1:] != (P, 2) or visible.shape != xy.shape[:2]:
             raise InputError(

@@ -126,13 +126,15 @@ def onp(S: np.ndarray, W: np.ndarray, weights: np.ndarray | None = None, scale: 
 def _checked(
     S: np.ndarray, W: np.ndarray, weights: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    S, W = np.asarray(S, float), np.asarray(W, float)
+    try:
+        S, W = np.asarray(S, float), np.asarray(W, float)
+        weights = weights if weights is None else np.asarray(weights, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"onp needs arrays of numbers: {error}") from None
     if S.ndim != 3 or S.shape[1] != 3 or W.shape != (S.shape[0], 2, S.shape[2]):
         raise InputError(f"onp needs S (N,3,P) and W (N,2,P), got {S.shape} and {W.shape}")
-    if weights is not None:
-        weights = np.asarray(weights, float)
-        if weights.shape != (S.shape[0], S.shape[2]):
-            raise InputError(f"onp needs weights (N,P) = {(S.shape[0], S.shape[2])}, got {weights.shape}")
+    if weights is not None and weights.shape != (S.shape[0], S.shape[2]):
+        raise InputError(f"onp needs weights (N,P) = {(S.shape[0], S.shape[2])}, got {weights.shape}")
     return S, W, weights
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 CLOUD, POSES, YOLO = ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "yolo_msgs/msg/DetectionArray")
 HRI, ZED, AI = ("hri_msgs/msg/Skeleton2D", "zed_msgs/msg/ObjectsStamped", "ai_msgs/msg/PerceptionTargets")
+FORMER_YOLO, FORMER_ZED = "yolov8_msgs/msg/DetectionArray", "zed_interfaces/msg/ObjectsStamped"
 OPENDR = "opendr_interface/msg/OpenDRPose2D"
 OPENPOSE_LIST, OPENPOSE_FRAME = "openpose_ros2_msgs/msg/PoseKeyPointsList", "ros_openpose/msg/Frame"
 

@@ -10,7 +10,7 @@ import pytest
 from conftest import camera_info, header_of
 from foreign_messages import LiveMake
 
-from msg_adapters import MessageError, WrongPointCount, outputs, read, read_camera_info
+from msg_adapters import MessageError, Source, UnknownLayout, WrongPointCount, outputs, read, read_camera_info
 from msg_adapters.palette import SIDE_COLOURS, rgb
 
 CLOUD, POSES, YOLO = ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "yolo_msgs/msg/DetectionArray")
@@ -303,6 +303,103 @@ def test_pose_array_that_is_3d(make, z):
 
 def test_pose_array_with_another_number_of_points(make):
     assert reason_of(POSES, poses_of(make, np.zeros((P + 1, 3)))) == "wrong_point_count"
+
+
+@pytest.mark.parametrize("total, points", [(10, 5), (10, 10), (15, 5)])
+def test_a_list_is_not_divided_while_the_layout_is_unknown(make, total, points):
+    """10 points are one body of 10 or two of 5; with a known layout the number of persons is sure."""
+    xy = np.random.default_rng(0).uniform(10, 500, (total, 2))
+    lists = {
+        POSES: poses_of(make, np.column_stack([xy, np.zeros(total)])[None]),
+        CLOUD: cloud_of(make, xy_columns(xy[None])),
+    }
+    for type_name, msg in lists.items():
+        with pytest.raises(UnknownLayout, match=f"{total} keypoints in one list") as error:
+            read(type_name, msg, points, Source(candidates=(5, 10)))
+        assert error.value.reason == "layout_unknown" and error.value.fits(5) and not error.value.fits(7)
+        assert read(type_name, msg, points).persons == total // points
+
+
+def test_a_list_of_one_person_and_rows_of_persons_are_read_while_the_layout_is_unknown(make):
+    source = Source(candidates=(5, 10, 7))
+    for xyz in (np.ones((0, 3)), np.column_stack([some_points(1)[0] * 9, np.zeros(P)])):
+        assert read(POSES, poses_of(make, xyz), P, source).persons == len(xyz) // P
+    assert read(CLOUD, cloud_of(make, xy_columns(some_points(4))), P, source).persons == 4
+
+
+# --- numbers that mean something else
+
+
+@pytest.mark.parametrize("x, y", [(0, 0), (-1, -1), (-999, -999)])
+def test_placeholders_are_missing_in_every_family(make, x, y):
+    xy = some_points(1) * 9
+    xy[0, 2] = x, y
+    messages = {
+        CLOUD: cloud_of(make, {**xy_columns(xy), "confidence": np.full((1, P), 0.9)}),
+        POSES: poses_of(make, np.dstack([xy, [[0.9, 0.8, min(x, 0.7), 0.9, 0.9]]])),
+        YOLO: detections_of(make, [("1", [(n + 1, *xy[0, n].tolist(), 0.9) for n in range(P)])]),
+    }
+    for type_name, msg in messages.items():
+        assert read(type_name, make.through_cdr(msg), P).visible.tolist() == [[True, True, False, True, True]]
+
+
+@pytest.mark.parametrize("confidence", [[0, 34, 87.5, 99, 100], [-4.1, 2.2, 0.3, 5, -0.2], [0.9, 0.8, 1.2, 0.7, 1]])
+def test_confidences_outside_0_to_1_are_noted(make, confidence):
+    """Percentages, logits, and peaks far over 1."""
+    got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1) * 9), "confidence": np.array([confidence])}), P)
+    (note,) = got.notes
+    assert note.reason == "confidence_range" and f"{max(confidence):.4g}" in note.text and "percent" in note.text
+    assert got.confidence.tolist() == np.clip(np.float32([confidence]), 0, 1).tolist()
+
+
+@pytest.mark.parametrize("confidence", [[0, 0.5, 1, 1.05, 0.9], [-1, -1, 0.5, 0.6, 1], [np.nan, -0.01, 1, 1, 1]])
+def test_usual_confidences_are_not_noted(make, confidence):
+    columns = {**xy_columns(some_points(1) * 9), "confidence": np.array([confidence])}
+    assert read(CLOUD, cloud_of(make, columns), P).notes == ()
+
+
+def test_percentages_in_a_pose_array_are_refused_as_such(make):
+    xyz = np.dstack([some_points(1) * 9, [[87, 45, 99, 100, 3]]])
+    with pytest.raises(MessageError, match="no percentage"):
+        read(POSES, poses_of(make, xyz), P)
+
+
+@pytest.mark.parametrize("name", ["score", "visibility", "conf", "likelihood", "probability", "c"])
+def test_a_confidence_by_another_name_is_used(make, name):
+    confidence = np.linspace(0.1, 0.9, P)[None]
+    got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1) * 9), name: confidence}), P)
+    np.testing.assert_allclose(got.confidence, confidence, rtol=1e-6)
+    assert got.notes == ()
+
+
+def test_fields_that_are_not_used_are_named(make):
+    half, other = np.full((1, P), 0.5), np.full((1, P), 0.1)
+    columns = {**xy_columns(some_points(1) * 9), "visibility": other, "confidence": half, "track_id": other}
+    got = read(CLOUD, cloud_of(make, columns), P)
+    (note,) = got.notes
+    assert note.reason == "unused_fields" and "fields visibility, track_id of" in note.text
+    np.testing.assert_array_equal(got.confidence, half)
+    columns = {**xy_columns(some_points(1) * 9), "visibility": other, "score": half}
+    got = read(CLOUD, cloud_of(make, columns), P)
+    np.testing.assert_array_equal(got.confidence, half)
+    assert "fields visibility of" in got.notes[0].text and "only x, y, score are" in got.notes[0].text
+
+
+def test_normalised_keypoints_are_refused(make):
+    xy = np.random.default_rng(0).uniform(-0.2, 1.3, (2, P, 2))
+    messages = {
+        CLOUD: cloud_of(make, xy_columns(xy)),
+        POSES: poses_of(make, np.dstack([xy, np.zeros((2, P))])),
+        YOLO: detections_of(make, [("1", [(n + 1, *xy[0, n].tolist(), 0.9) for n in range(P)])]),
+    }
+    for type_name, msg in messages.items():
+        assert reason_of(type_name, make.through_cdr(msg)) == "normalised"
+
+
+@pytest.mark.parametrize("scale, spread", [(400, 1), (1, 0)])
+def test_pixels_and_points_in_one_place_are_not_normalised(make, scale, spread):
+    xy = 1 + spread * np.random.default_rng(0).uniform(0, scale, (1, P, 2))
+    assert read(CLOUD, cloud_of(make, xy_columns(xy)), P).visible.all()
 
 
 # --- yolo_msgs, which has no rclpy package here

@@ -46,6 +46,7 @@ WITHOUT_EXAMPLES = [
     "paul_ros.normalisation",
     "paul_ros.output_files",
     "paul_ros.pinhole_pose",
+    "paul_ros.placeholders",
     "paul_ros.placement",
     "paul_ros.route",
     "paul_ros.shape_fit",

@@ -8,7 +8,7 @@ import pytest
 from conftest import FOCAL, camera_info
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_foreign_bags import BODIES, FRAMES, IDS, PIXELS, Factory, image_messages, topics_for, write
+from test_foreign_bags import BODIES, FRAMES, IDS, PIXELS, STATED, Factory, image_messages, topics_for, write
 
 from msg_adapters import read_camera_info
 from paul_ros.layout import load_layout
@@ -210,7 +210,8 @@ def rays(fx: float = FOCAL) -> np.ndarray:
 
 @pytest.mark.parametrize("name", IDS)
 def test_a_bag_of_every_family_is_data(tmp_path, name):
-    data = load_training_data(write(tmp_path / "in.mcap", name), topic=topics_for(name).keypoints)
+    bag, stated = write(tmp_path / "in.mcap", name), STATED.get(name)
+    data = load_training_data(bag, load_layout(stated) if stated else None, topics_for(name).keypoints)
     assert data.calibrated and data.visible.all() and data.left_out == 0 and data.layout == load_layout("coco17")
     np.testing.assert_allclose(data.W, rays(), atol=1e-5)
 
@@ -284,3 +285,40 @@ def test_a_bag_with_several_bodies_needs_a_choice(tmp_path):
         load_training_data(bag)
     anna = load_training_data(bag, topic=BODIES.replace("*", "anna"))
     np.testing.assert_allclose(anna.W, rays()[::2], atol=1e-5)
+
+
+# --- numbers that mean something else
+
+
+def test_placeholders_in_arrays_are_missing_and_counted(tmp_path):
+    W, hidden = views(40), np.random.default_rng(1).random((40, 9)) < 0.25
+    zeros, minus = W.copy(), W.copy()
+    zeros.transpose(0, 2, 1)[hidden], minus.transpose(0, 2, 1)[hidden] = 0, -1
+    nan = np.where(hidden[:, None], np.nan, W)
+    whole = load(tmp_path, W=nan)
+    for marked in (dict(W=zeros), dict(W=minus), dict(W=zeros, visible=np.ones((40, 9), bool))):
+        data = load(tmp_path, **marked)
+        assert data.sha256 == whole.sha256
+        assert data.notes[0] == f"{hidden.sum()} of 360 points at (0, 0) or (-1, -1) taken as missing"
+    detected = load(tmp_path, W=W, detected=zeros).detected
+    np.testing.assert_array_equal(np.isnan(detected).all(1), hidden)
+
+
+def test_the_origin_of_relative_arrays_stays(tmp_path):
+    W = views(40)
+    data = load(tmp_path, W=W - W[:, :, [4]])
+    assert data.visible.all() and not any("missing" in note for note in data.notes)
+
+
+def test_normalised_arrays_are_noted(tmp_path):
+    assert any("normalised" in note for note in load(tmp_path, W=views() / 640).notes)
+    centred = views() - views().mean(2, keepdims=True)
+    for arrays in (dict(W=views()), dict(W=centred / 640), dict(W=centred / 640, calibrated=True)):
+        assert not any("normalised" in note for note in load(tmp_path, **arrays).notes)
+
+
+def test_a_bag_of_lists_is_not_divided_by_guess(tmp_path):
+    bag = write(tmp_path / "in.mcap", "pose_array", with_camera=False)
+    with pytest.raises(DataError, match="34 keypoints in one list may be one body or several.*--layout"):
+        load_training_data(bag)
+    assert len(load_training_data(bag, load_layout("coco17")).W) == 2 * FRAMES

@@ -405,3 +405,52 @@ def test_either_form_names_the_other(model_file, tmp_path, capsys):
     assert "a model is judged without --truth: MODEL DATA" in capsys.readouterr().err
     assert cli.main(["evaluate", "humen", str(data)]) == 1
     assert "--truth" not in capsys.readouterr().err
+
+
+# --- units
+
+
+def pinhole(S, aside=(1500.0, -500.0), focal=600.0, centre=(320.0, 240.0), depth=4000.0):
+    """Return the pixels (F,2,P) of shapes moved in front of a camera, its matrix, and the moved shapes."""
+    S = S + np.array([*aside, depth])[:, None]
+    K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
+    return focal * S[:, :2] / S[:, 2:] + np.array(centre)[:, None], K, S
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.001])
+def test_pixels_against_metres_are_judged_with_the_camera_or_refused(model_file, tmp_path, capsys, unit):
+    W, K, S = pinhole(turned(model_file))
+    best = evaluate(model_file, write(tmp_path / "d.npz", turned(model_file)), tmp_path)
+    report = evaluate(model_file, write(tmp_path / "p.npz", unit * S, W=W, K=K), tmp_path)
+    assert best["ne_flip_frame_percent"] < report["ne_flip_frame_percent"] < 3
+    central, _, ahead = pinhole(turned(model_file), aside=(0.0, 0.0))
+    rays = (central - K[:2, 2, None]) / 600
+    report = evaluate(model_file, write(tmp_path / "r.npz", unit * ahead, W=rays, calibrated=True), tmp_path)
+    assert report["ne_flip_frame_percent"] < 3
+    for name, coordinates in (("pixels", W), ("rays", rays)):
+        if unit == 1.0 and name == "pixels":
+            coordinates = 100 * coordinates
+        data = write(tmp_path / f"{name}.npz", unit * S, W=coordinates)
+        assert cli.main(["evaluate", str(model_file), str(data)]) == 1
+        assert "times as large as x and y of S" in capsys.readouterr().err
+
+
+def test_other_frames_than_the_cameras_are_refused(model_file, tmp_path):
+    S = turned(model_file)
+    with pytest.raises(DataError, match="point in opposite directions"):
+        load_sequence(write(tmp_path / "up.npz", S, W=S[:, :2] * [[1], [-1]]))
+    with pytest.raises(DataError, match="no view of S"):
+        load_sequence(write(tmp_path / "side.npz", S, W=S[:, [2, 0]]))
+    with pytest.raises(DataError, match="S is not in front"):
+        load_sequence(write(tmp_path / "behind.npz", S, K=np.eye(3)))
+    with pytest.raises(DataError, match="K in .* must be a camera matrix"):
+        load_sequence(write(tmp_path / "k.npz", S, K=np.eye(2)))
+    noisy = S[:, :2] + 0.2 * S.std() * np.random.default_rng(0).standard_normal(S[:, :2].shape)
+    assert load_sequence(write(tmp_path / "noisy.npz", S, W=noisy)).visible.all()
+
+
+def test_placeholders_are_hidden(model_file, tmp_path):
+    S = turned(model_file) + np.array([300.0, 300, 0])[:, None]
+    W = S[:, :2].copy()
+    W[3, :, 5] = 0
+    assert load_sequence(write(tmp_path / "d.npz", S, W=W)).visible.sum() == S.shape[0] * 17 - 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, header_of
 
-from msg_adapters import SUPPORTED, MessageError, Source, WrongPointCount, hri, openpose, read, zed
+from msg_adapters import SUPPORTED, MessageError, Source, WrongPointCount, hri, named_layout, openpose, read, zed
 from paul_ros.layout import layout_names, load_layout
 
 COCO = load_layout("coco17").names
@@ -371,3 +371,42 @@ def test_zed_orders_name_points_as_layouts_do_and_both_sides_alike(own):
     assert len(set(named)) == len(named) and set(COCO) <= set(named) <= set(ALL_NAMES)
     sides = [{name.split("_", 1)[1] for name in named if name.startswith(side)} for side in ("left_", "right_")]
     assert sides[0] == sides[1]
+
+
+# --- former names and versions
+
+
+def test_former_type_names_are_the_same_adapters(make):
+    assert SUPPORTED[foreign.FORMER_YOLO] is SUPPORTED[foreign.YOLO]
+    msg = foreign.zed(make, header_of(make), [POSE])
+    assert_pose(read_of(make, foreign.FORMER_ZED, msg), COCO, COCO)
+    assert named_layout(foreign.FORMER_ZED, msg) == named_layout(foreign.ZED, msg) == "zed38"
+
+
+@pytest.mark.parametrize("slots, body_format, own", [(18, 0, foreign.OPENPOSE18), (34, 0, foreign.OPENPOSE18),
+                                                     (34, 2, foreign.ZED34), (34, 1, foreign.ZED34)])  # fmt: skip
+def test_zed_versions_with_fewer_slots(slots, body_format, own):
+    """Before version 4.0: 18 or 34 slots, and the constant of BODY_34 was 2."""
+    make = foreign.LiveMake()
+    msg = foreign.zed(make, header_of(make), [POSE], {18: 0, 34: 1}[len(own)])
+    (body,) = msg.objects
+    body.body_format, body.skeleton_2d.keypoints = body_format, body.skeleton_2d.keypoints[:slots]
+    assert_pose(read_of(make, foreign.FORMER_ZED, msg), COCO, own)
+    if body_format == 0:
+        del body.body_format
+        assert_pose(read_of(make, foreign.FORMER_ZED, msg), COCO, own)
+
+
+@pytest.mark.parametrize("percent, expected", [(80.0, 0.8), (0.0, 1.0), (np.nan, 1.0)])
+def test_zed_confidences_are_percentages(percent, expected):
+    make = foreign.LiveMake()
+    msg = foreign.zed(make, header_of(make), [POSE])
+    msg.objects[0].skeleton_keypoint_confidence = np.full(70, percent)
+    got = read_of(make, foreign.ZED, msg)
+    np.testing.assert_allclose(got.confidence, expected)
+    assert not got.notes
+
+
+@pytest.mark.parametrize("name, own", [("zed34", zed.BODY34), ("zed38", zed.BODY38), ("zed18", openpose.OPENPOSE18)])
+def test_zed_layouts_have_the_orders_of_the_adapter(name, own):
+    assert load_layout(name).names == own

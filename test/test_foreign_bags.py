@@ -144,14 +144,19 @@ FOUND = {
     **dict.fromkeys(("zed18", "openpose_list", "opendr"), "openpose18"),
     "hri": "hri18",
     "openpose_frame in": "body25",
+    "zed34 in": "zed34",
+    "zed38 in": "zed38",
 }
+#: Bag -> the layout to state: nothing shows that its lists of 34 points are two persons.
+STATED = {"pose_array": "coco17"}
 
 
 @pytest.mark.parametrize("name", IDS)
 def test_a_bag_of_every_family_is_lifted_in_metres(tmp_path, model_file, name):
-    """Without a word on the layout: it is found, and of the family's points those are given that the model has."""
+    """The layout is found if the messages tell it, and of the family's points those are given that the model has."""
     bag = write(tmp_path / "in.mcap", name)
-    done = replay(bag, open_stream(str(model_file)), tmp_path / "out.mcap", topics_for(name))
+    stream = open_stream(str(model_file), STATED.get(name))
+    done = replay(bag, stream, tmp_path / "out.mcap", topics_for(name))
     assert not done.stream.ledger.drops and done.damage is None
     assert [frame.stamp for frame in done.frames] == [n * 10**9 + 5 for n in range(1, FRAMES + 1)]
     for frame, pixels in zip(done.frames, PIXELS):
@@ -252,7 +257,7 @@ def test_a_bag_without_stamps_and_frames(tmp_path, model_file, name, with_camera
 
 def test_every_type_that_can_be_read_has_such_a_bag():
     bagged = {type_name for type_name, _, _ in WHOLE.values()} | {foreign.HRI, foreign.OPENDR}
-    assert bagged == set(msg_adapters.SUPPORTED)
+    assert bagged == set(msg_adapters.SUPPORTED) - {foreign.FORMER_YOLO, foreign.FORMER_ZED}
 
 
 @pytest.mark.parametrize("name", ["zed38", "opendr", "hri"])

@@ -15,17 +15,32 @@ from hypothesis import strategies as st
 
 from paul_ros.errors import LayoutError
 from paul_ros.layout import Handedness, Layout, anonymous_layout, layout_names, load_layout, midpoints
+from paul_ros.model_file import load_model
 
 POINTS = {
+    "ap10k17": 17,
     "body25": 25,
     "cmu31": 31,
     "coco17": 17,
+    "drobotics19": 19,
     "h36m17": 17,
+    "halpe26": 26,
+    "hand21": 21,
     "hri18": 18,
     "human": 43,
+    "kinect32": 32,
     "mediapipe33": 33,
+    "mpii16": 16,
     "openpose18": 18,
+    "wholebody133": 133,
+    "wholebody23": 23,
+    "zed18": 18,
+    "zed34": 34,
+    "zed38": 38,
 }
+#: Layouts of other things than persons.
+OTHERS = ("ap10k17", "hand21")
+PEOPLE = [name for name in POINTS if name not in OTHERS]
 DOOR = {
     "name": "door",
     "names": ["hinge_top", "hinge_bottom", "handle", "latch"],
@@ -88,7 +103,8 @@ def test_a_shipped_layout_is_one_body(name: str) -> None:
     reached = {layout.root[0]}
     for _ in layout.names:
         reached |= {point for edge in layout.edges if set(edge) & reached for point in edge}
-    assert {layout.names[point] for point in set(range(len(layout.names))) - reached} == set()
+    nameless = {"body_kps_17", "body_kps_18"} if name == "drobotics19" else set()
+    assert {layout.names[point] for point in set(range(len(layout.names))) - reached} == nameless
 
 
 @pytest.mark.parametrize("name", POINTS)
@@ -105,7 +121,7 @@ def test_sides_are_complete_and_symmetric(name: str) -> None:
     assert set(layout.mirror[list(layout.root)]) == set(layout.root)
 
 
-@pytest.mark.parametrize("name", POINTS)
+@pytest.mark.parametrize("name", PEOPLE)
 def test_handedness_tells_a_person_from_the_mirror_image(name: str) -> None:
     layout = load_layout(name)
 
@@ -137,6 +153,63 @@ def test_point_orders_that_are_easily_confused() -> None:
     assert load_layout("body25").names[8::11] == ("pelvis", "left_big_toe")
     assert load_layout("h36m17").names[1::10] == ("right_hip", "left_shoulder")
     assert load_layout("mediapipe33").names[11] == "left_shoulder"
+
+
+def test_orders_of_further_layouts() -> None:
+    """Facts from the publishers: mmpose's dataset configurations, the ZED and the Azure Kinect SDK, hobot."""
+    coco = load_layout("coco17").names
+    for name in ("halpe26", "wholebody23", "wholebody133", "drobotics19"):
+        assert load_layout(name).names[:17] == coco
+    assert load_layout("halpe26").names[17:23] == (
+        "head_top", "upper_neck", "pelvis", "left_big_toe", "right_big_toe", "left_small_toe",
+    )  # fmt: skip
+    whole = load_layout("wholebody133").names
+    assert whole[:23] == load_layout("wholebody23").names and whole[17:20] == (
+        "left_big_toe",
+        "left_small_toe",
+        "left_heel",
+    )
+    # The face begins at the right ear, the hands follow the face, left first.
+    assert (whole[23], whole[31], whole[39]) == ("right_jaw_1", "chin", "left_jaw_1")
+    assert (whole[59], whole[68]) == ("right_eye_outer", "left_eye_outer")
+    assert (whole[71], whole[77]) == ("right_mouth_corner", "left_mouth_corner")
+    assert (whole[91], whole[96], whole[111], whole[112], whole[132]) == (
+        "left_hand_root", "left_index_knuckle", "left_pinky_4", "right_hand_root", "right_pinky_4",
+    )  # fmt: skip
+    assert load_layout("mpii16").names[::3] == (
+        "right_ankle", "left_hip", "pelvis", "head_top", "right_shoulder", "left_wrist",
+    )  # fmt: skip
+    assert load_layout("zed18").names == load_layout("openpose18").names
+    assert load_layout("zed34").names[:32] == load_layout("kinect32").names
+    assert load_layout("kinect32").names[5::13] == ("left_shoulder", "left_hip", "right_ear")
+    assert load_layout("zed38").names[5::7] == (
+        "nose", "left_shoulder", "right_hip", "left_small_toe", "right_index_knuckle",
+    )  # fmt: skip
+    assert load_layout("hand21").names[::4] == ("wrist", "thumb_4", "index_4", "middle_4", "ring_4", "pinky_4")
+    assert load_layout("ap10k17").names[2:5] == ("animal_nose", "animal_neck", "tail_root")
+
+
+@pytest.mark.parametrize("name", PEOPLE)
+def test_a_projected_person_arrives_in_its_own_places(name: str) -> None:
+    """A picture of the human model, given in any layout of persons, shows the model the same pixels again."""
+    human, layout = load_layout("human"), load_layout(name)
+    points = load_model("human").mean_shape
+    pixels = (300 * points[:2] / points[2].max() + 500).T[None]
+    place = {name: index for index, name in enumerate(human.names)}
+    given = np.array([[pixels[0, place[p]] if p in place else (np.nan, np.nan) for p in layout.names]])
+    seen = np.isfinite(given).all(2)
+    xy, _, visible = layout.map_to(human)(given, seen.astype(float), seen)
+    own = [place[p] for p in layout.names if p in place]
+    assert len(own) >= 12 and visible[0, own].all()
+    np.testing.assert_allclose(xy[0, own], pixels[0, own])
+    # Derived points are midpoints, which the model's own differ from by little.
+    np.testing.assert_allclose(xy[visible], pixels[visible], atol=0.05 * np.ptp(pixels))
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_things_do_not_pass_for_persons(name: str) -> None:
+    with pytest.raises(LayoutError, match="has 0 of the 43 points of 'human'.*coco17"):
+        load_layout(name).map_to(load_layout("human"))
 
 
 BODIES = ("body25", "coco17", "h36m17", "hri18", "mediapipe33", "openpose18")
@@ -251,7 +324,7 @@ def test_all_but_name_names_and_root_may_be_left_out() -> None:
     [
         ("coco", "did you mean 'coco17'"),
         ("Body_25", "did you mean 'body25'"),
-        ("excavator", "There are body25, cmu31"),
+        ("excavator", "There are ap10k17, body25"),
         ("nowhere/door.yaml", "nowhere/door.yaml: no such file"),
     ],
 )

@@ -464,7 +464,7 @@ BAD = [
     ("npz", {"keypoints": np.ones((1, 17, 4))}, "keypoints is (1, 17, 4)"),
     ("npz", {"W": np.ones((1, 17, 2))}, "W is (1, 17, 2); it must be (F,2,P)"),
     ("npz", {"keypoints": np.ones((0, 17, 2))}, "holds no persons"),
-    ("npz", {"keypoints": np.ones((1, 19, 2))}, "no shipped layout of 19 keypoints fits"),
+    ("npz", {"keypoints": np.ones((1, 29, 2))}, "no shipped layout of 29 keypoints fits"),
     ("npz", {"keypoints": np.ones((1, 17, 2), complex)}, "keypoints has type complex128; it must be number"),
     ("npz", {"keypoints": np.full((1, 17, 2), "a")}, "keypoints has type <U1; it must be number"),
     ("npz", {"keypoints": np.full((1, 17, 2), None)}, "pickled objects"),
@@ -577,3 +577,33 @@ def test_numpy_is_all_that_it_needs(persons, model_file, tmp_path):
     )
     words = ["lift", str(source), "-o", str(tmp_path / "out.npz"), "--model", str(model_file)]
     subprocess.run([sys.executable, "-c", code, *words], cwd=ROOT, check=True, capture_output=True)
+
+
+# --- numbers that mean something else
+
+
+def test_placeholders_in_files_are_missing(tmp_path, capsys):
+    xy = np.random.default_rng(0).uniform(100, 400, (5, 17, 2))
+    marked, hidden = xy.copy(), xy.copy()
+    marked[1, 3], hidden[1, 3] = 0, np.nan
+    marked[2, 4], hidden[2, 4] = -1, np.nan
+    for kind, write in (("npz", None), ("csv", table), ("json", frames)):
+        results = []
+        for name, points in (("marked", marked), ("hidden", hidden)):
+            source, out = tmp_path / f"{name}.{kind}", tmp_path / f"{name}.out.npz"
+            source.write_text(write(points)) if write else npz(source, keypoints=points)
+            assert lift(source, out, "human") == 0
+            results.append(read(out)["points"])
+            printed = capsys.readouterr().out
+            assert ("taken as missing (2 points)" in printed) == (name == "marked")
+        np.testing.assert_array_equal(*results)
+
+
+def test_normalised_keypoints_and_odd_confidences_are_said(tmp_path, capsys):
+    xy = np.random.default_rng(0).uniform(0, 1, (5, 17, 2))
+    source = npz(tmp_path / "n.npz", keypoints=xy, confidence=np.full((5, 17), 87.0))
+    assert lift(source, tmp_path / "o.npz", "human") == 0
+    printed = capsys.readouterr().out
+    assert "normalised to 0..1" in printed and "divide percentages by 100" in printed
+    assert lift(source, tmp_path / "o.npz", "human", "--intrinsics", 600, 600, 320, 240) == 1
+    assert "degenerate_points" in (refusal := capsys.readouterr().err) and "image's width" in refusal

@@ -10,13 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from msg_adapters.keypoints import Intrinsics
 from paul_ros import shape_fit
-from paul_ros.errors import ModelError
+from paul_ros.errors import InputError, ModelError
 from paul_ros.layout import load_layout
+from paul_ros.lift_arguments import HEIGHTS
 from paul_ros.lifted import BEHIND_CAMERA, DEGENERATE_POINTS, TOO_FAR, TOO_FEW_POINTS
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.placement import centred_view
 from paul_ros.shape_fit import fit_shapes
+from paul_ros.stream.parameters import PARAMETERS
 
 CAMERA = Intrinsics(900.0, 900.0, 640.0, 360.0, 1280, 720)
 
@@ -418,3 +420,23 @@ def test_the_root_is_the_middle_of_the_hips():
         np.testing.assert_array_equal(lifted.root, lifted.points[:, point("pelvis")])
         hips = lifted.points[2, [point("left_hip"), point("right_hip")]].mean(0)
         assert np.linalg.norm(lifted.root[2] - hips) > 1e-3
+
+
+@pytest.mark.parametrize("height", [170, 5.7, 0.1, -1.7, float("nan"), "1.7", None])
+def test_a_height_that_is_no_persons_in_metres_is_refused(height):
+    with pytest.raises(InputError, match="pass metres, from 0.3 to 3"):
+        Lifter("human", person_height=height)
+    assert [(row.least, row.limits[1]) for row in PARAMETERS if row.name == "person_height"] == [HEIGHTS]
+
+
+def test_ragged_arrays_are_refused():
+    ragged = [[[1, 2]] * 43, [[1, 2]] * 42]
+    with pytest.raises(InputError, match="arrays of numbers"):
+        Lifter("human").lift_in_model_layout(ragged, np.ones((2, 43), bool))
+    with pytest.raises(InputError, match="arrays of numbers"):
+        Lifter("human").lift_in_model_layout(np.ones((2, 43, 2)), [[True] * 43, [True] * 42])
+
+
+def test_points_of_another_number_are_told_layouts_that_fit_the_model():
+    with pytest.raises(InputError, match="layout='coco17'; these have so many points: coco17, h36m17$"):
+        Lifter("human").lift(np.ones((1, 17, 2)))

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from paul_ros import viewing_sphere
 from paul_ros.arithmetic import Floats, cross_of_parts
+from paul_ros.errors import InputError
 from paul_ros.orthographic_n_point import _Points, onp
 from paul_ros.viewing_goal import Problem, newton, view_along
 from paul_ros.viewing_sphere import solve
@@ -605,3 +606,11 @@ def test_an_unknown_scale_is_refused():
     for scale in ("Unit", "fixed", None):
         with pytest.raises(ValueError, match="scale is 'free' or 'unit'"):
             onp(S, W, scale=scale)
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_ragged_arrays_are_refused(place):
+    arguments = [np.ones((2, 3, 5)), np.ones((2, 2, 5)), np.ones((2, 5))]
+    arguments[place] = [np.ones((2, 5)).tolist(), np.ones((2, 4)).tolist()]
+    with pytest.raises(InputError, match="arrays of numbers"):
+        onp(*arguments)

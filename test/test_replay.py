@@ -527,3 +527,23 @@ def test_bytes_that_are_no_message_are_a_counted_drop(model_file, tmp_path):
     assert drops > 5 and done.damage is None and "does not decode" in done.stream.ledger.advice["undecodable"]
     lost = len(all_of_it.frames) - len(done.frames)
     assert 3 < lost <= drops and done.frames[-1].stamp == all_of_it.frames[-1].stamp
+
+
+@pytest.mark.parametrize("left_out", ["/nothing", "/camera_info"])
+@pytest.mark.parametrize(
+    "factor, unit", [(1000, "millimetres"), (100, "centimetres"), (0.01, ""), (1, None), (0.6, None)]
+)
+def test_a_truth_that_is_not_in_metres_is_refused(model_file, tmp_path, left_out, factor, unit):
+    with BagWriter(tmp_path / "x.mcap") as writer:
+        for topic, _, message, time in list(read_messages(ONE))[:30]:
+            if topic == "/ground_truth/poses":
+                for pose in message.poses:
+                    where = pose.position
+                    where.x, where.y, where.z = factor * where.x, factor * where.y, factor * where.z
+            if topic != left_out:
+                writer.write(topic, message, time)
+    report = evaluate(replay(tmp_path / "x.mcap", open_stream(model_file)))
+    refused = report["dropped"].get("truth_not_metres", 0)
+    assert bool(refused) == (unit is not None) == (report["n_mpjpe_mm"] is None)
+    if refused:
+        assert unit in report["advice"]["truth_not_metres"] and "metres" in report["advice"]["truth_not_metres"]

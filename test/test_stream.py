@@ -22,7 +22,7 @@ from paul_ros.stream import advice
 from paul_ros.stream.messages import MessageBuilder
 from paul_ros.stream.stream import LiftStream, Outcome, open_stream
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
+CLOUD, POSES = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray"
 GOOD = persons_at((0.3, 0, 4), (-1, 0.1, 5))
 
 
@@ -228,11 +228,86 @@ def test_a_wrong_number_of_points_names_the_layouts_that_fit(stream, make):
     assert_drops(stream, CLOUD, cloud(make, np.ones((2, 25, 2))))
     explanation = stream.ledger.advice["wrong_point_count"]
     assert "body25" in explanation and "h36m17" not in explanation and "`layout`" in explanation
-    assert_drops(stream, CLOUD, cloud(make, np.ones((2, 23, 2))))
+    assert_drops(stream, CLOUD, cloud(make, np.ones((2, 29, 2))))
     explanation = stream.ledger.advice["wrong_point_count"]
-    assert "23" in explanation and "path" in explanation
+    assert "29" in explanation and "path" in explanation
     assert stream.ledger.drops == {"wrong_point_count": 2}
     assert_lifts(stream, make)
+
+
+@pytest.mark.parametrize("points", [34, 36, 51, 68, 136])
+@pytest.mark.parametrize("type_name", [POSES, CLOUD])
+def test_a_list_of_several_bodies_or_one_is_refused_until_the_layout_is_known(model_file, make, type_name, points):
+    """Two persons of 17 points, or one of 34: nobody can tell, and a message of one person or `layout` says it."""
+
+    def message(count: int):
+        xy = np.resize(seen(GOOD), (1, count, 2)) + np.arange(count)[:, None]
+        if type_name == CLOUD:
+            return cloud(make, xy)
+        return outputs.pose_array(make, header_of(make), np.dstack([xy, np.ones((1, count))]))
+
+    for model in ("human", str(model_file)):
+        stream = open_stream(model)
+        assert_drops(stream, type_name, message(points))
+        assert stream.ledger.drops == {"layout_unknown": 1} and stream.describe()["input_layout"] is None
+        explanation = stream.ledger.advice["layout_unknown"]
+        own = "openpose18" if points == 36 else "coco17"
+        assert f"{points} keypoints" in explanation and own in explanation and "`layout`" in explanation
+    assert open_stream("human", own).keypoints(type_name, message(points)).frame.keypoints.persons == points // (
+        18 if points == 36 else 17
+    )
+    stream.keypoints(type_name, message(17))
+    assert stream.describe()["input_layout"] == "coco17" and stream.counts["persons"] == 1
+    if points % 17 == 0:
+        assert stream.keypoints(type_name, message(points)).frame.keypoints.persons == points // 17
+
+
+@pytest.mark.parametrize(
+    "points, found",
+    [(16, "mpii16"), (17, "coco17"), (18, "openpose18"), (19, "drobotics19"), (23, "wholebody23"), (25, "body25"),
+     (26, "halpe26"), (31, "cmu31"), (32, "kinect32"), (33, "mediapipe33"), (34, "zed34"), (38, "zed38"),
+     (43, "human"), (133, "wholebody133")],
+)  # fmt: skip
+def test_rows_of_persons_find_the_layout_by_their_number(make, points, found):
+    stream = open_stream("human")
+    xy = np.random.default_rng(0).uniform(50, 400, (2, points, 2))
+    assert stream.keypoints(CLOUD, cloud(make, xy)).frame.keypoints.persons == 2
+    assert stream.describe()["input_layout"] == found
+
+
+def test_d_robotics_default_of_19_points_is_found(bag_make):
+    stream, xy = open_stream("human"), seen(GOOD)[0].tolist()
+    target = foreign.ai_target(bag_make, 3, body_kps=([*xy, (300, 100), (300, 60)], [0.9] * 19))
+    frame = stream.keypoints(foreign.AI, foreign.ai(bag_make, header_of(bag_make), [target])).frame
+    assert frame.lifted.ok.all() and stream.describe()["input_layout"] == "drobotics19"
+
+
+def test_notes_of_a_message_are_counted(stream, make):
+    frame = stream.keypoints(CLOUD, cloud(make, seen(GOOD), np.full((2, 17), 87.0))).frame
+    assert frame.lifted.ok.all() and stream.ledger.notes == {"confidence_range": 1}
+    assert "divide percentages by 100" in stream.ledger.advice["confidence_range"]
+
+
+def test_normalised_keypoints_are_dropped(stream, make):
+    assert_drops(stream, CLOUD, cloud(make, seen(GOOD) / (640, 480)))
+    assert stream.ledger.drops == {"normalised": 1} and "image's width" in stream.ledger.advice["normalised"]
+    assert_lifts(stream, make)
+
+
+@pytest.mark.parametrize("own, taken", [("h36m17", "coco17"), ("hri18", "openpose18"), ("coco17", "h36m17")])
+def test_a_wrong_guess_among_layouts_of_one_size_is_noted(make, own, taken):
+    """The numbers of points are equal; the poses then are none that the model has."""
+    human = load_model("human")
+    points = human.mean_shape.T * 0.4 + (0.1, 0, 4)
+    pixels = points[:, :2] / points[:, 2:] * 600 + 320
+    xy = human.layout.map_to(load_layout(own)).values(pixels[None])
+    stream = open_stream("human", taken)
+    stream.keypoints(CLOUD, cloud(make, xy))
+    right = open_stream("human", own)
+    right.keypoints(CLOUD, cloud(make, xy))
+    assert not right.ledger.notes
+    # Swapped eyes and ears alone are too little to tell.
+    assert bool(stream.ledger.notes) == (own != "hri18") or stream.ledger.drops
 
 
 def test_only_layouts_that_map_onto_the_model_are_proposed(model_file, make):

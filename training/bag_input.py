@@ -16,6 +16,7 @@ from paul_ros.errors import BagError
 from paul_ros.extras import require
 from paul_ros.layout import Layout
 from paul_ros.placement import centred_view
+from paul_ros.wording import quantity
 from training.data import RawFrames
 from training.errors import DataError
 
@@ -48,9 +49,21 @@ class _Cameras:
 
 
 def read_bag(
-    path: Path, layout: Layout, topic: str | None, min_confidence: float, camera_info_topic: str | None = None
+    path: Path,
+    layout: Layout,
+    topic: str | None,
+    min_confidence: float,
+    guessed: bool,
+    camera_info_topic: str | None = None,
 ) -> RawFrames:
     """Read the keypoints of a bag; see ``load_training_data``.
+
+    Args:
+        path: of the bag.
+        layout: of the points.
+        topic: that is read, with * for any part of a name; None reads all.
+        min_confidence: points of a lower one are hidden.
+        guessed: nobody named the layout, so a plain list of points is one person until a message shows that.
 
     Raises:
         MissingPackageError: the packages that read bags are missing.
@@ -62,8 +75,9 @@ def read_bag(
 
     cameras = _bag_cameras(path, topic, camera_info_topic)
     rejections = dict(cameras.rejections)
+    refused: dict[tuple[str, str], tuple[int, str]] = {}
     recording = Recording(path)
-    frames = _bag_keypoints(recording, layout, topic, cameras.image_size, rejections)
+    frames = _bag_keypoints(recording, layout, topic, cameras.image_size, rejections, refused, guessed)
     if not frames:
         _check_topic(path, topic)
         raise DataError(
@@ -73,7 +87,7 @@ def read_bag(
     if len(frames) > 1:
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
     ((name, messages),) = frames.items()
-    notes = _losses(recording, {of: why for of, why in rejections.items() if matches(of, name)})
+    notes = _losses(recording, {what: last for what, last in refused.items() if matches(what[0], name)})
     if cameras.intrinsics:
         messages = [(time, msg_adapters.in_pinhole(message, cameras.at(time))) for time, message in messages]
     xy = np.concatenate([message.xy for _, message in messages])
@@ -95,14 +109,21 @@ def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrin
     return np.concatenate([np.empty((0, 2, xy.shape[1])), *views])
 
 
-def _losses(recording: Recording, rejections: dict[str, str]) -> tuple[str, ...]:
-    """Return notes of what could not be read: training goes on with the whole messages."""
+def _losses(recording: Recording, refused: dict[tuple[str, str], tuple[int, str]]) -> tuple[str, ...]:
+    """Return notes of what could not be read: training goes on with the whole messages.
+
+    Args:
+        recording: as far as it was read.
+        refused: topic and reason -> number of messages, and the text of the last.
+    """
     path, notes = recording.path, []
     if recording.damage:
         # The folders of one machine are no provenance.
         notes.append(f"its whole messages are used: {str(recording.damage).replace(str(path), path.name)}")
-    if rejections:
-        notes.append(f"messages of '{path.name}' are left out{_reasons(rejections)}")
+    notes += [
+        f"{quantity(count, 'message')} on {topic} left out, {reason}; of the last: {why}"
+        for (topic, reason), (count, why) in refused.items()
+    ]
     return tuple(notes)
 
 
@@ -123,6 +144,8 @@ def _bag_keypoints(
     topic: str | None,
     image_size: tuple[int, int] | None,
     rejections: dict[str, str],
+    refused: dict[tuple[str, str], tuple[int, str]],
+    guessed: bool,
 ) -> dict[str, list[tuple[int, msg_adapters.Keypoints2D]]]:
     """Return the log times (nanoseconds) and keypoints of messages by topic.
 
@@ -132,6 +155,8 @@ def _bag_keypoints(
         topic: that is read, with * for any part of a name; None reads all.
         image_size: width and height in pixels, if known.
         rejections: is given the last reason for which messages of a topic were rejected.
+        refused: is given the number of rejected messages by topic and reason, and the last text.
+        guessed: see ``read_bag``.
     """
     from paul_ros.offline.bag_reader import matches
 
@@ -140,11 +165,14 @@ def _bag_keypoints(
         name, type_name = record.topic, record.type_name
         if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
             continue
-        source = msg_adapters.Source(layout.names, image_size, name)
+        candidates = (len(layout.names),) if guessed and not frames else ()
+        source = msg_adapters.Source(layout.names, image_size, name, candidates=candidates)
         try:
             keypoints = msg_adapters.read(type_name, record.message(), len(layout.names), source)
         except (BagError, msg_adapters.MessageError) as error:
             rejections[name] = str(error)
+            what = name, getattr(error, "reason", "undecodable")
+            refused[what] = refused.get(what, (0, ""))[0] + 1, str(error)
         else:
             if keypoints.persons:
                 frames.setdefault(topic or name, []).append((record.log_time, keypoints))

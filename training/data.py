@@ -31,7 +31,7 @@ class RawFrames:
         layout: of the points.
         calibrated: W are rays, see ``TrainingData``.
         detected: (G,2,P) or None, see ``TrainingData``.
-        notes: what of the file could not be read, a sentence each.
+        notes: oddities of the file, a sentence each.
     """
 
     W: np.ndarray

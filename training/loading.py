@@ -46,5 +46,6 @@ def load_training_data(
         raise DataError(f"{path}: no such file or folder")
     if path.suffix == ".npz":
         return checked(read_arrays(path, layout), path, guessed=layout is None)
-    layout = layout or load_layout(DEFAULT_LAYOUT)
-    return checked(read_bag(path, layout, topic, min_confidence, camera_info_topic), path, guessed=False)
+    named = layout or load_layout(DEFAULT_LAYOUT)
+    raw = read_bag(path, named, topic, min_confidence, layout is None, camera_info_topic)
+    return checked(raw, path, guessed=False)

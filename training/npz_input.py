@@ -10,6 +10,7 @@ import numpy as np
 from paul_ros.errors import LayoutError, NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout, anonymous_layout, load_layout
+from paul_ros.placeholders import look_normalised, placeholders
 from training.data import DEFAULT_LAYOUT, RawFrames
 from training.errors import DataError
 
@@ -27,14 +28,18 @@ def read_arrays(path: Path, layout: Layout | None) -> RawFrames:
         raise DataError(f"'{path}' {error} (training needs W (F,2,P))") from error
     layout = layout or _guessed_layout(arrays, path)
     W = _image_points(arrays, layout, path)
-    calibrated = _flags(arrays, "calibrated", path)
-    return RawFrames(
-        W,
-        _visibility(arrays, W, path),
-        layout,
-        calibrated is not None and calibrated.size == 1 and bool(calibrated.all()),
-        _detections(arrays, W, path),
-    )
+    flag = _flags(arrays, "calibrated", path)
+    calibrated = flag is not None and flag.size == 1 and bool(flag.all())
+    given = _visibility(arrays, W, path)
+    missing = placeholders(W[:, 0], W[:, 1], given)
+    visible = given & ~missing
+    notes = [f"{missing.sum()} of {given.sum()} points at (0, 0) or (-1, -1) taken as missing"] if missing.any() else []
+    if not calibrated and look_normalised(W[:, 0], W[:, 1], visible):
+        notes.append(
+            "the coordinates look normalised to 0..1: multiply x by the image's width and y by its height, "
+            "or all shapes are distorted"
+        )
+    return RawFrames(W, visible, layout, calibrated, _detections(arrays, W, path), tuple(notes))
 
 
 def _image_points(arrays: dict[str, np.ndarray], layout: Layout, path: Path) -> np.ndarray:
@@ -67,7 +72,10 @@ def _detections(arrays: dict[str, np.ndarray], W: np.ndarray, path: Path) -> np.
         raise DataError(
             f"detected in '{path}' must be numbers {W.shape} to go with W, it is {detected.dtype} {detected.shape}"
         )
-    return detected
+    if detected is None:
+        return None
+    missing = placeholders(detected[:, 0], detected[:, 1], np.isfinite(detected).all(1))
+    return np.where(missing[:, None], np.nan, detected) if missing.any() else detected
 
 
 def _guessed_layout(arrays: dict[str, np.ndarray], path: Path) -> Layout:

@@ -17,6 +17,9 @@ DATA is an npz with
   S:        (F,3,P) the truth in the camera frame; NaN where it is unknown
   visible:  (F,P) optional; the model sees visible points only, but errors
             cover all points
+  K:        (3,3) optional; then W are pixels of this camera, and S is in its
+            units from the camera
+  calibrated: optional; if true, W are rays (x/z, y/z), as with K
   edges:    (E,2) optional, for the picture
   metres:   optional; if true, distances are given in mm, otherwise in the
             units of W

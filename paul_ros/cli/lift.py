@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 FORMATS = ("npz", "csv", "json")
 
 _LIFTED = ""  # the reason of a lifted person
-_UNLIKE = "unlike_the_model"
 _DESCRIPTION = """\
 Lift arrays of 2D keypoints to 3D, each person alone, as the ROS 2 node does. No ROS is needed.
 The points are in metres from the camera if a camera is given, otherwise in model units from each person's root.
@@ -132,18 +131,17 @@ def run(args: argparse.Namespace) -> None:
     given = {name: getattr(args, name) for name in ("model", "person_height", "min_confidence")}
     parameters = checked({name: value for name, value in given.items() if value is not None})
     lifter = Lifter(load_model(parameters["model"]), parameters["person_height"])
-    tally: Counter[str] = Counter()
+    tally = _Tally()
     summary = _lift(args, kinds, lifter, parameters["min_confidence"], tally)
-    if not tally[_LIFTED]:
+    if not tally.reasons[_LIFTED]:
         name = "standard input" if args.input == STDOUT else args.input
-        raise KeypointFileError(f"{name}: nobody could be lifted ({_reasons(tally)}): check --layout and the keypoints")
+        advice = "; ".join(text for text, _ in tally.notes.values()) or "check --layout and the keypoints"
+        raise KeypointFileError(f"{name}: nobody could be lifted ({_reasons(tally)}): {advice}")
     print(summary, file=sys.stderr if args.output == STDOUT else sys.stdout)
 
 
-def _lift(
-    args: argparse.Namespace, kinds: list[str], lifter: Lifter, min_confidence: float, tally: Counter[str]
-) -> str:
-    """Lift from file to file; count persons in `tally` by reason. Return the line for the user."""
+def _lift(args: argparse.Namespace, kinds: list[str], lifter: Lifter, min_confidence: float, tally: _Tally) -> str:
+    """Lift from file to file and keep the tally. Return the lines for the user."""
     from paul_ros.layout import load_layout
     from paul_ros.lifted import IMAGE_AXES, OPTICAL_FRAME
     from paul_ros.offline.arrays import lift_persons
@@ -168,40 +166,57 @@ def _lift(
     return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, session, route.given.name)])
 
 
-def _counted(batches: Batches, tally: Counter[str], count: Callable[[int], None]) -> Batches:
-    """Yield the batches while their persons are counted by the reason why they were not lifted."""
+class _Tally:
+    """Counts of a file.
+
+    Attributes:
+        reasons: number of persons by the reason why they were not lifted; _LIFTED for the others.
+        unlike: number of persons whom no shape of the model fits well.
+        notes: reason -> a sentence about something irregular, and the number of points.
+    """
+
+    def __init__(self) -> None:
+        self.reasons: Counter[str] = Counter()
+        self.unlike = 0
+        self.notes: dict[str, tuple[str, int]] = {}
+
+
+def _counted(batches: Batches, tally: _Tally, count: Callable[[int], None]) -> Batches:
+    """Yield the batches while the tally is kept."""
     from paul_ros.lifted import UNLIKE_MODEL
 
     for persons, lifted in batches:
-        tally.update(lifted.reason)
-        tally[_UNLIKE] += int((lifted.unexplained > UNLIKE_MODEL).sum())
+        tally.reasons.update(lifted.reason)
+        tally.unlike += int((lifted.unexplained > UNLIKE_MODEL).sum())
+        for reason, (text, number) in persons.notes.items():
+            tally.notes[reason] = text, number + tally.notes.get(reason, ("", 0))[1]
         yield persons, lifted
         count(len(lifted.reason))
 
 
-def _summary(args: argparse.Namespace, tally: Counter[str], layout: str, units: str) -> str:
-    persons = sum(number for reason, number in tally.items() if reason != _UNLIKE)
+def _summary(args: argparse.Namespace, tally: _Tally, layout: str, units: str) -> str:
+    persons = tally.reasons.total()
     reasons = _reasons(tally)
     output = "standard output" if args.output == STDOUT else args.output
     return (
-        f"{output}: {tally[_LIFTED]} of {quantity(persons, 'person')} lifted, layout {layout}, "
+        f"{output}: {tally.reasons[_LIFTED]} of {quantity(persons, 'person')} lifted, layout {layout}, "
         f"units {units}{f'; not lifted: {reasons}' if reasons else ''}"
     )
 
 
-def _reasons(tally: Counter[str]) -> str:
-    left_out = sorted((reason, number) for reason, number in tally.items() if reason not in (_LIFTED, _UNLIKE))
+def _reasons(tally: _Tally) -> str:
+    left_out = sorted((reason, number) for reason, number in tally.reasons.items() if reason != _LIFTED)
     return ", ".join(f"{number} {reason}" for reason, number in left_out)
 
 
-def _notes(tally: Counter[str], session: Session, layout: str) -> list[str]:
-    notes = []
+def _notes(tally: _Tally, session: Session, layout: str) -> list[str]:
+    notes = [f"note: {text} ({number} points)" for text, number in tally.notes.values()]
     if session.intrinsics is None:
         notes.append("note: no camera, so lengths are in model units; give --camera or --intrinsics for metres")
     notes += [f"note: {advice}" for advice in session.ledger.advice.values()]
-    if tally[_UNLIKE]:
+    if tally.unlike:
         notes.append(
-            f"note: no shape of the model fits {tally[_UNLIKE]} of the persons well; if the keypoints are not in the "
+            f"note: no shape of the model fits {tally.unlike} of the persons well; if the keypoints are not in the "
             f"order of layout {layout}, set --layout"
         )
     return notes

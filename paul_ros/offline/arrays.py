@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,9 +14,14 @@ from paul_ros.errors import LayoutError
 from paul_ros.layout import Layout
 from paul_ros.lifted import Lifted
 from paul_ros.lifter import Lifter
+from paul_ros.placeholders import look_normalised, placeholders
 from paul_ros.route import Route
 from paul_ros.stream.layout_search import candidates
 from paul_ros.stream.session import Session
+
+_NORMALISED = (
+    "keypoints look normalised to 0..1; multiply x by the image's width and y by its height, or poses are distorted"
+)
 
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 
@@ -31,6 +36,7 @@ class Persons:
         xy: (N,P,2) pixels; NaN where hidden.
         confidence: (N,P) in 0..1; 1 where the source has none.
         visible: (N,P) bool.
+        notes: reason -> a sentence about something irregular, and the number of points.
     """
 
     frame: np.ndarray
@@ -38,6 +44,7 @@ class Persons:
     xy: np.ndarray
     confidence: np.ndarray
     visible: np.ndarray
+    notes: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -48,7 +55,7 @@ class Persons:
         confidence: np.ndarray | None = None,
         visible: np.ndarray | None = None,
     ) -> Persons:
-        """Hide what no camera can have seen, by the rules for messages.
+        """Hide what no camera can have seen, by the rules for messages, and placeholders.
 
         Args:
             frame: (N,) int.
@@ -57,8 +64,16 @@ class Persons:
             confidence: (N,P), or None if the source has none.
             visible: (N,P) bool, or None if hidden points are NaN.
         """
-        read = record(xy, confidence, person, _NO_HEADER, visible)
-        return cls(frame, person, read.xy, read.confidence, read.visible)
+        shown = np.isfinite(xy).all(axis=2) if visible is None else visible
+        missing = placeholders(xy[..., 0], xy[..., 1], shown)
+        read = record(xy, confidence, person, _NO_HEADER, shown & ~missing, placeholders=False)
+        seen = int(read.visible.sum())
+        notes = {note.reason: (note.text, seen) for note in read.notes}
+        if missing.any():
+            notes["placeholder"] = "points at (0, 0) or (-1, -1) are taken as missing", int(missing.sum())
+        if look_normalised(read.xy[..., 0], read.xy[..., 1], read.visible):
+            notes["normalised"] = _NORMALISED, seen
+        return cls(frame, person, read.xy, read.confidence, read.visible, notes)
 
     @classmethod
     def stacked(cls, frame: list[int], person: list[str], keypoints: list[np.ndarray]) -> Persons:

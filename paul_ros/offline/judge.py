@@ -12,6 +12,7 @@ import numpy as np
 
 from paul_ros.lifted import AMBIGUOUS
 from paul_ros.lifter import Lifter
+from paul_ros.offline import truth_units
 from paul_ros.offline.depth_flips import FlipCounter
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.truth_errors import ERROR_KEYS, TruthErrors, number
@@ -53,6 +54,7 @@ class Judge:
         self._frames_in_metres = self._frames_without_metres = 0
         self._certified = self._ambiguous = 0
         self._reprojection, self._sigma, self._in_sigmas = array("d"), array("d"), array("d")
+        self._sizes, self._truths = array("d"), 0
 
     def add_frame(self, frame: LiftedFrame) -> None:
         """Take the next frame; it waits for its ground truth if that has not come."""
@@ -83,6 +85,7 @@ class Judge:
     def report(self, done: Replay) -> dict:
         """Return what `evaluate` explains."""
         self._judge_batch()
+        self._check_truth(done)
         stream = self._stream
         model, lifted = stream.lifter.model, len(self._reprojection)
         report = {
@@ -137,9 +140,20 @@ class Judge:
         self._errors.add([(frame.lifted, truth) for frame, truth in self._batch], root)
         rigid = [(rigid_frame(frame, self._rigid, self._stream).lifted, truth) for frame, truth in self._batch]
         self._rigid_errors.add(rigid, root)
+        metres = self._stream.lifter.metres_per_unit
+        self._truths += len(self._batch)
         for frame, truth in self._batch:
+            self._sizes.extend(truth_units.size_ratios(frame.lifted, truth, metres))
             self._in_sigmas.extend(_errors_in_sigmas(frame, truth, root).tolist())
         self._batch.clear()
+
+    def _check_truth(self, done: Replay) -> None:
+        """Discard a ground truth that is not in metres, and the errors against it, which is a counted drop."""
+        if problem := truth_units.problem(self._sizes):
+            self._stream.ledger.drop("truth_not_metres", problem, self._truths)
+            self._errors, self._rigid_errors, self._in_sigmas = TruthErrors(), TruthErrors(), array("d")
+            self._sizes = array("d")
+            done.truth.clear()
 
     def _units(self) -> str:
         if self._frames_in_metres and self._frames_without_metres:

@@ -66,6 +66,12 @@ _ALL = (
         "Set `layout` (paul: `--layout`) to the layout of your detector, or to the path of your own layout file.",
     ),
     Reason(
+        "layout_unknown",
+        DROP,
+        "A message holds one list of keypoints that may be one body or several, and the layout is not known yet",
+        "Set `layout` to the layout of your detector. A message with one person makes it known too.",
+    ),
+    Reason(
         "no_common_names",
         DROP,
         "The message names keypoints, and the layout has none of them",
@@ -124,6 +130,12 @@ _ALL = (
         DROP,
         "Coordinates of hri_msgs/Skeleton2D lie outside 0..1",
         "Divide x by the image's width and y by its height.",
+    ),
+    Reason(
+        "normalised",
+        DROP,
+        "All keypoints of a message lie within 0..1, where pixels are expected",
+        "Multiply x by the image's width and y by its height in the detector.",
     ),
     Reason(
         "no_image_size",
@@ -185,6 +197,12 @@ _ALL = (
         DROP,
         "The number of ground-truth points is not a multiple of the input layout's points",
         "Record the ground truth in the layout of the keypoints, person by person.",
+    ),
+    Reason(
+        "truth_not_metres",
+        DROP,
+        "The ground truth is many times as large or as small as the persons that were lifted, so it is not in metres",
+        "Record the ground truth in metres, in the frame of the camera.",
     ),
     # --- persons
     Reason(
@@ -258,6 +276,18 @@ _ALL = (
         "The frame_id of the keypoints differs from that of CameraInfo",
         "Check that both come from one camera. Let the detector use the optical frame: outputs keep its frame_id and "
         "have x right, y down, z forward.",
+    ),
+    Reason(
+        "confidence_range",
+        NOTE,
+        "Confidences lie outside 0..1 and are clipped, so `min_confidence` hides other points than it says",
+        "Send 0..1: divide percentages by 100, or send the sigmoid of logits.",
+    ),
+    Reason(
+        "unused_fields",
+        NOTE,
+        "A PointCloud2 has fields that are not used",
+        "Send one confidence (0 to 1) as the field confidence and ids as person_id, and leave other fields out.",
     ),
     Reason(
         "unlike_the_model",

@@ -65,7 +65,7 @@ class Session:
         known = self.intrinsics.notes if self.intrinsics else ()
         for note in camera.notes:
             if note not in known:
-                self.ledger.note(note.reason, note.advice)
+                self.ledger.note(note.reason, note.text)
         self.intrinsics, self.image_size = camera, (camera.width, camera.height)
 
     def choose_image(self, image: str) -> None:

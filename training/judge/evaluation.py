@@ -46,7 +46,7 @@ def evaluate_model(
         ModelError: the model cannot be used.
     """
     model = _load_model(model_name)
-    truth = load_sequence(data).among_categories(model.layout)
+    truth = load_sequence(data, turned=True).among_categories(model.layout)
     if len(model.layout.names) != truth.W.shape[2]:
         raise DataError(
             f"'{data}' has {truth.W.shape[2]} points, model '{model_name}' has {len(model.layout.names)}: "

@@ -8,10 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
+from msg_adapters.keypoints import Intrinsics
 from paul_ros.errors import NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout
+from paul_ros.placeholders import placeholders
+from paul_ros.placement import centred_view
 from training.errors import DataError
+
+_SCALES = (0.8, 1.25)
+"""Size of W over that of S seen from the front, if both have one unit; with 20 % noise on W it is 1.02."""
+
+_LEAST_LIKENESS = 0.5
+"""Least correlation of W and S seen from the front, if S is in the camera frame."""
+
+_LEAST_POINTS = 4
+"""Points of a frame by which W and S are compared."""
 
 
 @dataclass(frozen=True)
@@ -91,17 +103,26 @@ def random_rotations(count: int, seed: int) -> np.ndarray:
     return Q
 
 
-def load_sequence(path: str | Path) -> Sequence:
-    """Read an npz with W (F,2,P), the truth S (F,3,P) and, optionally, visible (F,P), edges (E,2), metres (one bool).
+def load_sequence(path: str | Path, turned: bool = False) -> Sequence:
+    """Read an npz with W (F,2,P) and the truth S (F,3,P).
+
+    Optional arrays: visible (F,P), edges (E,2), metres (one bool), K (3,3), the camera matrix of pixels W, and
+    calibrated (one bool): W are rays. With either of the last two, W becomes the view of a weak-perspective camera at
+    the mean depth of S, in the units of S.
+
+    Args:
+        path: of the npz.
+        turned: with K, W and S become those of cameras that are turned to the object, as the Lifter's are.
 
     Raises:
-        DataError: the file is missing or damaged, or an array is missing or does not fit the others.
+        DataError: the file is missing or damaged, an array is missing or does not fit the others, or W and S have
+            different units or frames.
     """
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file")
     try:
-        arrays = read_npz(path, ("W", "S"), ("visible", "edges", "metres"))
+        arrays = read_npz(path, ("W", "S"), ("visible", "edges", "metres", "K", "calibrated"))
     except NpzError as error:
         raise DataError(f"'{path}' {error} (evaluation needs W (F,2,P) and the truth S (F,3,P))") from error
     for name, rows in (("W", 2), ("S", 3)):
@@ -109,16 +130,19 @@ def load_sequence(path: str | Path) -> Sequence:
             raise DataError(
                 f"{name} in '{path}' must be numbers (F,{rows},P), it is {arrays[name].dtype} {arrays[name].shape}"
             )
-    return _sequence(path, **arrays)
+    return _sequence(path, turned, **arrays)
 
 
 def _sequence(
     path: Path,
+    turned: bool,
     W: np.ndarray,
     S: np.ndarray,
     visible: np.ndarray | None = None,
     edges: np.ndarray | None = None,
     metres: np.ndarray | None = None,
+    K: np.ndarray | None = None,
+    calibrated: np.ndarray | None = None,
 ) -> Sequence:
     frames, points = len(W), W.shape[2]
     if S.shape != (frames, 3, points) or not frames:
@@ -127,8 +151,14 @@ def _sequence(
     if visible.shape != (frames, points) or not np.isin(visible, (0, 1)).all():
         raise DataError(f"visible in '{path}' must be {(frames, points)} of bool (or 0 and 1), it is {visible.shape}")
     visible = visible.astype(bool) & np.isfinite(W).all(1)
+    visible &= ~placeholders(W[:, 0], W[:, 1], visible)
     if not np.isfinite(S).any():
         raise DataError(f"the truth S in '{path}' holds no number")
+    if K is not None:
+        W, S = _rays(W, S, visible, _camera(K, path), turned)
+    if K is not None or _is_true(calibrated):
+        W = W * _mean_depth(S, path)[:, None, None]
+    _check_units(W, S, visible & np.isfinite(S).all(1), path)
     edges = np.zeros((0, 2), int) if edges is None else edges
     if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu" or not _within(edges, points):
         raise DataError(f"edges in '{path}' must be (E,2) indices of the {points} points")
@@ -138,13 +168,79 @@ def _sequence(
         visible=visible,
         S=S.astype(_floating(S), copy=False),
         edges=edges,
-        metres=metres is not None and metres.size == 1 and bool(metres.all()),
+        metres=_is_true(metres),
     )
+
+
+def _camera(K: np.ndarray, path: Path) -> Intrinsics:
+    if K.shape != (3, 3) or K.dtype.kind not in "fiu" or not (K[[0, 1], [0, 1]] > 0).all():
+        raise DataError(f"K in '{path}' must be a camera matrix (3,3) in pixels with positive focal lengths")
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    return Intrinsics(fx, fy, cx, cy, 0, 0)
+
+
+def _rays(
+    W: np.ndarray, S: np.ndarray, visible: np.ndarray, camera: Intrinsics, turned: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rays (F,2,P) of pixels W and the truth S (F,3,P), in the frames of cameras turned to the object or not."""
+    if not turned:
+        offset, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+        return (W - offset[:, None]) / focal[:, None], S
+    rays, truth = np.zeros(W.shape), S.astype(float)
+    some = visible.any(1)
+    view = centred_view(W[some].transpose(0, 2, 1), visible[some], camera)
+    rays[some], truth[some] = np.nan_to_num(view.W), view.turn.transpose(0, 2, 1) @ truth[some]
+    return rays, truth
+
+
+def _mean_depth(S: np.ndarray, path: Path) -> np.ndarray:
+    """Return the mean depth (F,) of the true points; 1 in frames without any, which are not judged."""
+    known = np.isfinite(S[:, 2])
+    depth = np.where(known, S[:, 2], 0.0).sum(1) / np.maximum(known.sum(1), 1)
+    if not (depth[known.any(1)] > 0).all():
+        raise DataError(f"'{path}' has a camera, but S is not in front of it: save S in the frame of the camera")
+    return np.where(known.any(1), depth, 1.0)
+
+
+def _check_units(W: np.ndarray, S: np.ndarray, known: np.ndarray, path: Path) -> None:
+    """Refuse points W (F,2,P) that are no view of S (F,3,P) in its units, by the points known in both (F,P)."""
+    seen, front = (_about_mean(points, known) for points in (W, S[:, :2]))
+    size, true_size = (np.sqrt((points**2).sum((1, 2))) for points in (seen, front))
+    rows = (known.sum(1) >= _LEAST_POINTS) & (size > 0) & (true_size > 0)
+    if not rows.any():
+        return
+    scale = float(np.median(size[rows] / true_size[rows]))
+    along = (seen * front).sum(2)[rows] / (size * true_size)[rows, None]
+    alike_x, alike_y = np.median(along, axis=0).tolist()
+    if alike_y < 0 < alike_x and alike_x - alike_y >= _LEAST_LIKENESS:
+        raise DataError(f"y of W and of S in '{path}' point in opposite directions: let both point down")
+    if alike_x + alike_y < _LEAST_LIKENESS:
+        raise DataError(
+            f"W in '{path}' is no view of S along its z axis: save S in the frame of the camera (x right, y down, z "
+            "forward)"
+        )
+    low, high = _SCALES
+    if not low <= scale <= high:
+        raise DataError(
+            f"W in '{path}' is {scale:.3g} times as large as x and y of S: they have different units, such as "
+            "pixels and metres. Save the camera matrix as K (3,3), or bring W and S to one unit"
+        )
+
+
+def _about_mean(points: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return points (F,2,P) about the mean of the known ones (F,P); 0 where unknown."""
+    points = np.where(known[:, None], points, 0.0).astype(float)
+    count = np.maximum(known.sum(1), 1)[:, None, None]
+    return np.where(known[:, None], points - points.sum(2, keepdims=True) / count, 0.0)
 
 
 def _floating(array: np.ndarray) -> type:
     """Return the array's floating type; float32 is kept because dense truth fills memory."""
     return np.float32 if array.dtype == np.float32 else np.float64
+
+
+def _is_true(flag: np.ndarray | None) -> bool:
+    return flag is not None and flag.size == 1 and bool(flag.all())
 
 
 def _within(edges: np.ndarray, points: int) -> bool:

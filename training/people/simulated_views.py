@@ -27,7 +27,7 @@ class SimulatedViews:
         W: (N,2,P) float32 rays (x/z, y/z) of the virtual cameras, with the detector's errors; 0 where hidden.
         visible: (N,P) whether the detector reports the point.
         marked: (N,2,P) float32 true rays of all points; NaN for points too near to the virtual camera.
-        S: (N,3,P) float32 truth in the virtual cameras' frames, metres, centred on the mean of all points.
+        S: (N,3,P) float32 truth in the virtual cameras' frames, metres.
         confidence: (N,P) from 0 to 1; 0 where hidden.
         xy: (N,P,2) pixels of the real cameras, with the detector's errors; NaN where hidden.
         points: (N,P,3) truth in the real cameras' optical frames, metres.
@@ -85,7 +85,7 @@ def _from_virtual_cameras(
         W=np.where(visible[:, None], view.W, 0).astype(np.float32),
         visible=visible,
         marked=np.where(depth > _MIN_DEPTH, S[:, :2] / np.maximum(depth, _MIN_DEPTH), np.nan).astype(np.float32),
-        S=(S - S.mean(2, keepdims=True)).astype(np.float32),
+        S=S.astype(np.float32),
         confidence=np.where(visible, found.confidence, 0.0),
         xy=np.where(visible[..., None], found.xy, np.nan),
         points=truth,
