@@ -93,6 +93,7 @@ def test_lifted_bag_holds_inputs_and_outputs(short, model_file, tmp_path):
         "/lifter/layout": 2,
         "/lifter/poses": 90,
         "/lifter/bodies": 90,
+        "/lifter/persons": 90,
         "/lifter/keypoints3d": 90,
         "/lifter/markers": 90,
     }
