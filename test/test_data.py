@@ -5,7 +5,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from conftest import camera_info
+from conftest import FOCAL, camera_info
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_foreign_bags import BODIES, FRAMES, IDS, PIXELS, STATED, Factory, image_messages, topics_for, write
@@ -202,10 +202,10 @@ def test_the_image_unit_is_the_rms_coordinate(tmp_path, monkeypatch, block):
 # --- bags of every message family
 
 
-def rays() -> np.ndarray:
+def rays(fx: float = FOCAL) -> np.ndarray:
     """Rays (F,2,17) of all those bags, by the camera in them."""
     xy = PIXELS.reshape(-1, 17, 2)
-    return centred_view(xy, np.ones(xy.shape[:2], bool), read_camera_info(camera_info(Factory()))).W
+    return centred_view(xy, np.ones(xy.shape[:2], bool), read_camera_info(camera_info(Factory(), fx=fx))).W
 
 
 @pytest.mark.parametrize("name", IDS)
@@ -250,8 +250,33 @@ def test_the_size_of_an_uncalibrated_camera_turns_shares_into_pixels(tmp_path):
 def test_cameras_of_two_sizes_are_refused(tmp_path):
     other = camera_info(Factory(), fx=0.0)
     other.width = 1280
-    with pytest.raises(DataError, match="2 cameras"):
+    with pytest.raises(DataError, match="several cameras on /camera_info"):
         load_training_data(write_shares(tmp_path / "in.mcap", camera_info(Factory()), other), topic=BODIES)
+
+
+def test_another_camera_on_the_same_topic_is_refused(tmp_path):
+    infos = camera_info(Factory()), camera_info(Factory(), fx=1.02 * FOCAL)
+    with pytest.raises(DataError, match="several cameras on /camera_info"):
+        load_training_data(write_shares(tmp_path / "in.mcap", *infos), topic=BODIES)
+
+
+def test_a_camera_may_jitter_and_each_frame_has_the_latest(tmp_path):
+    """As in replay; before the first CameraInfo, training takes that one, since it need not wait for it."""
+    bag, make = tmp_path / "in.mcap", Factory()
+    jittered = 1.009 * FOCAL
+    with BagWriter(bag, make) as writer:
+        for number in range(FRAMES):
+            if number:
+                info = camera_info(make, fx=FOCAL if number < FRAMES - 1 else jittered)
+                writer.write("/cam/info", info, 10 * number - 1)
+            for topic, message in image_messages(make, "hri", number):
+                writer.write(topic, message, 10 * number)
+    W = load_training_data(bag, topic=BODIES).W
+    calm, last = rays(), rays(jittered)
+    persons = len(W) // FRAMES
+    np.testing.assert_allclose(W[:-persons], calm[:-persons], atol=1e-5)
+    np.testing.assert_allclose(W[-persons:], last[-persons:], atol=1e-5)
+    assert np.abs(calm - last)[-persons:].max() > 1e-4
 
 
 def test_a_bag_with_several_bodies_needs_a_choice(tmp_path):

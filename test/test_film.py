@@ -18,6 +18,7 @@ from paul_ros import cli
 from paul_ros.errors import BagError, PictureError
 from paul_ros.model_file import load_model
 from paul_ros.offline import film, film_excerpt, film_model, film_stage
+from paul_ros.offline.bag_reader import read_records
 from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.canvas import AMBER, turntable
@@ -110,10 +111,22 @@ def test_no_keypoints_then(tmp_path, model_file):
         film.view_bag(bag, open_stream(str(model_file)), tmp_path / "f.gif", start=0.01, seconds=0.01)
 
 
+def test_frames_without_metres_are_not_drawn_among_metres(tmp_path, model_file, drawn, capsys):
+    """The first CameraInfo comes after a second: in model units a person would stand in the camera."""
+    whole, late = make_bag(tmp_path / "whole.mcap", 61), tmp_path / "late.mcap"
+    with BagWriter(late) as writer:
+        for record in read_records(whole):
+            if record.topic != "/camera_info" or record.log_time >= 2 * 10**9:
+                writer.write_record(record)
+    assert cli.main(["view", str(late), "-o", str(tmp_path / "f.gif"), "--model", str(model_file)]) == 0
+    assert len(drawn) == 11
+    assert capsys.readouterr().out.endswith(", 10 frames without metres left out\n")
+
+
 def test_no_keypoints_at_all(tmp_path, model_file, capsys):
     bag = make_bag(tmp_path / "short.mcap", 3)
     assert cli.main(["view", str(bag), "--topic", "/others", "-o", str(tmp_path / "f.gif")]) == 1
-    assert "no messages on /others; the bag holds" in capsys.readouterr().err
+    assert "no messages on /others; the topics with a type for keypoints are /keypoints" in capsys.readouterr().err
 
 
 def test_nobody_lifted(tmp_path, model_file):

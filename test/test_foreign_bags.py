@@ -19,8 +19,9 @@ from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.offline.bag_reader import matches, read_records
 from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_topics import Topics
 from paul_ros.offline.bag_writer import BagWriter
-from paul_ros.offline.replay import Topics, replay
+from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import LiftStream, open_stream
 
 COCO = load_layout("coco17").names
@@ -131,7 +132,7 @@ IDS = {**{name: ids for name, (_, _, ids) in WHOLE.items()}, "opendr": ("1", "2"
 
 
 def topics_for(name: str) -> Topics:
-    return Topics(keypoints=BODIES) if name == "hri" else Topics()
+    return Topics(keypoints=BODIES if name == "hri" else "/keypoints")
 
 
 # --- bags

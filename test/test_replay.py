@@ -19,10 +19,12 @@ from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.offline.bag_reader import read_messages, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages
+from paul_ros.offline.bag_topics import Topics
 from paul_ros.offline.bag_writer import BagWriter
-from paul_ros.offline.judge import count_flips, evaluate
+from paul_ros.offline.depth_flips import count_flips
+from paul_ros.offline.judge import evaluate
 from paul_ros.offline.picture import write_picture
-from paul_ros.offline.replay import Topics, replay
+from paul_ros.offline.replay import replay
 from paul_ros.offline.report import table
 from paul_ros.stream.stream import LiftStream, open_stream
 
@@ -332,7 +334,10 @@ def test_half_a_bag_keeps_what_was_read(model_file, tmp_path):
 @pytest.mark.parametrize(
     "change, clue",
     [
-        (without("/keypoints"), "no messages on /keypoints; the bag holds /camera_info"),
+        (
+            without("/keypoints"),
+            "no messages on /keypoints; the topics with a type for keypoints are /ground_truth/poses .*--topic",
+        ),
         (lambda record: None, "none at all"),
     ],
     ids=["other topics", "empty"],
@@ -347,10 +352,9 @@ def test_nothing_to_lift(short, model_file, tmp_path, change, clue):
 @pytest.mark.parametrize(
     "topics, clue",
     [
-        (Topics(keypoints="/camera_info", camera_info="/x"), "not readable as keypoints.*--topic"),
         (Topics(keypoints="/camera_info"), "sensor_msgs/msg/CameraInfo, not readable as keypoints.*--topic"),
-        (Topics(camera_info="/ground_truth/poses", truth="/x"), "--camera-info-topic"),
-        (Topics(truth="/camera_info", camera_info="/x"), "--ground-truth-topic"),
+        (Topics(camera_info="/ground_truth/poses"), "--camera-info-topic"),
+        (Topics(truth="/keypoints"), "--ground-truth-topic"),
     ],
 )
 def test_topic_of_the_wrong_type(short, model_file, tmp_path, topics, clue):
@@ -457,10 +461,13 @@ def test_the_distance_is_as_wrong_as_it_says(short, model_file):
         frame.lifted.root[:] = direction * (far + 1.5 * frame.lifted.distance_sigma[:, None])
     report = evaluate(done)
     assert (report["distance_within_1_sigma_share"], report["distance_within_2_sigma_share"]) == (0, 1)
-    assert (
-        evaluate(replay(short, open_stream(model_file), topics=Topics(camera_info="/x")))["distance_sigma_median_m"]
-        is None
-    )
+
+
+def test_without_metres_no_distance_is_stated(short, model_file, tmp_path):
+    bag = part_of(short, tmp_path / "x.mcap", 9, without("/camera_info"))
+    report = evaluate(replay(bag, open_stream(model_file)))
+    assert report["distance_sigma_median_m"] is None
+    assert report["unavailable"]["distance_sigma_median_m"] == "no metres: the bag has no CameraInfo"
 
 
 def test_flips_are_counted(model_file):

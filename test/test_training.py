@@ -17,7 +17,7 @@ from tiny_data import FROM_RANDOM_WEIGHTS, sequence
 from msg_adapters.outputs import keypoints_cloud
 from paul_ros.cli import main
 from paul_ros.cli import train as cli
-from paul_ros.errors import ModelError, OutputError
+from paul_ros.errors import BagError, ModelError, OutputError
 from paul_ros.layout import load_layout
 from paul_ros.model_file import load_model
 from paul_ros.offline.bag_reader import read_messages, read_records
@@ -253,14 +253,22 @@ def test_models_that_could_not_be_loaded_are_refused_before_training(data_file, 
     assert not list((tmp_path / "m.run").glob("*"))
 
 
-def test_a_bag_of_two_cameras_is_refused(tmp_path):
+def test_a_bag_of_two_cameras_needs_a_choice(tmp_path):
     with BagWriter(tmp_path / "two.mcap") as out:
         for topic, _, message, stamp in read_messages(BAG, {"/camera_info", "/keypoints"}):
             out.write(topic, message, stamp)
             if topic == "/camera_info":
                 out.write("/depth/camera_info", replace(message, p=2 * message.p), stamp)
-    with pytest.raises(DataError, match="2 cameras"):
+    with pytest.raises(BagError, match="2 cameras, on /camera_info, /depth/camera_info: .* --camera-info-topic"):
         load_training_data(tmp_path / "two.mcap", COCO)
+    with pytest.raises(BagError, match="no messages on /camera/info, did you mean '/camera_info'"):
+        load_training_data(tmp_path / "two.mcap", COCO, camera_info_topic="/camera/info")
+    near, far = (
+        load_training_data(tmp_path / "two.mcap", COCO, camera_info_topic=topic)
+        for topic in ("/camera_info", "/depth/camera_info")
+    )
+    assert np.array_equal(near.W, load_training_data(BAG, COCO).W)
+    assert np.ptp(far.W) < 0.6 * np.ptp(near.W)
 
 
 @pytest.mark.parametrize("length", ["[left_hip, left_hoof, 0.4]", "[nose, nose, 1]", "[nose, left_eye, x]", "5"])

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,14 +16,46 @@ from paul_ros.errors import BagError
 from paul_ros.extras import require
 from paul_ros.layout import Layout
 from paul_ros.placement import centred_view
+from paul_ros.wording import quantity
 from training.data import RawFrames
 from training.errors import DataError
 
 if TYPE_CHECKING:
     from paul_ros.offline.bag_reader import Recording
 
+_JITTER = 0.01
+"""Largest difference of the intrinsics of one camera, over its focal length."""
 
-def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: float, guessed: bool) -> RawFrames:
+
+@dataclass(frozen=True)
+class _Cameras:
+    """The CameraInfo of a bag.
+
+    Attributes:
+        intrinsics: usable ones with the log times (nanoseconds) from which they hold; those of one camera may differ
+            in the last digits.
+        image_size: width and height in pixels; None = unknown.
+        rejections: reasons of unusable messages by topic.
+    """
+
+    intrinsics: list[tuple[int, msg_adapters.Intrinsics]]
+    image_size: tuple[int, int] | None
+    rejections: dict[str, str]
+
+    def at(self, log_time: int) -> msg_adapters.Intrinsics:
+        """Return the latest intrinsics before a time, as replay does; before the first ones, the first."""
+        index = bisect.bisect_right(self.intrinsics, log_time, key=lambda timed: timed[0])
+        return self.intrinsics[max(index - 1, 0)][1]
+
+
+def read_bag(
+    path: Path,
+    layout: Layout,
+    topic: str | None,
+    min_confidence: float,
+    guessed: bool,
+    camera_info_topic: str | None = None,
+) -> RawFrames:
     """Read the keypoints of a bag; see ``load_training_data``.
 
     Args:
@@ -32,16 +67,17 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
 
     Raises:
         MissingPackageError: the packages that read bags are missing.
-        BagError: the bag cannot be read.
-        DataError: it has no keypoints of the layout, or several topics or cameras.
+        BagError: the bag cannot be read, or the camera of the keypoints is not clear.
+        DataError: it has no keypoints of the layout, several topics of them, or a topic with several cameras.
     """
     require("train", "mcap", "rosbags")
-    from paul_ros.offline.bag_reader import Recording
+    from paul_ros.offline.bag_reader import Recording, matches
 
-    camera, image_size, rejections = _bag_camera(path)
+    cameras = _bag_cameras(path, topic, camera_info_topic)
+    rejections = dict(cameras.rejections)
+    refused: dict[tuple[str, str], tuple[int, str]] = {}
     recording = Recording(path)
-    refused: dict[str, tuple[int, str]] = {}
-    frames = _bag_keypoints(recording, layout, topic, image_size, rejections, refused, guessed)
+    frames = _bag_keypoints(recording, layout, topic, cameras.image_size, rejections, refused, guessed)
     if not frames:
         _check_topic(path, topic)
         raise DataError(
@@ -50,24 +86,44 @@ def read_bag(path: Path, layout: Layout, topic: str | None, min_confidence: floa
         )
     if len(frames) > 1:
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
-    (messages,) = frames.values()
-    xy = np.concatenate([message.xy for message in messages])
-    visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for message in messages])
-    notes = _losses(recording, refused)
-    if camera is None:
+    ((name, messages),) = frames.items()
+    notes = _losses(recording, {what: last for what, last in refused.items() if matches(what[0], name)})
+    if cameras.intrinsics:
+        messages = [(time, msg_adapters.in_pinhole(message, cameras.at(time))) for time, message in messages]
+    xy = np.concatenate([message.xy for _, message in messages])
+    visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for _, message in messages])
+    if not cameras.intrinsics:
         return RawFrames(xy.transpose(0, 2, 1), visible, layout, calibrated=False, notes=notes)
     some = visible.any(1)
-    rays = centred_view(xy[some], visible[some], camera).W
+    owners = [cameras.at(time) for time, message in messages for _ in range(message.persons)]
+    rays = _rays(xy[some], visible[some], [owners[row] for row in np.flatnonzero(some)])
     return RawFrames(rays, visible[some], layout, calibrated=True, notes=notes)
 
 
-def _losses(recording: Recording, refused: dict[str, tuple[int, str]]) -> tuple[str, ...]:
-    """Return notes of what could not be read: training goes on with the whole messages."""
-    notes = [f"{count} messages left out, {reason}; of the last: {why}" for reason, (count, why) in refused.items()]
+def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrinsics]) -> np.ndarray:
+    """Return pixels (F,P,2) as rays (F,2,P), each frame by its own camera."""
+    runs = [len(list(run)) for _, run in itertools.groupby(cameras)]
+    ends = np.cumsum(runs, dtype=int)
+    parts = [slice(end - length, end) for end, length in zip(ends, runs)]
+    views = [centred_view(xy[part], visible[part], cameras[part.start]).W for part in parts]
+    return np.concatenate([np.empty((0, 2, xy.shape[1])), *views])
+
+
+def _losses(recording: Recording, refused: dict[tuple[str, str], tuple[int, str]]) -> tuple[str, ...]:
+    """Return notes of what could not be read: training goes on with the whole messages.
+
+    Args:
+        recording: as far as it was read.
+        refused: topic and reason -> number of messages, and the text of the last.
+    """
+    path, notes = recording.path, []
     if recording.damage:
         # The folders of one machine are no provenance.
-        path = recording.path
         notes.append(f"its whole messages are used: {str(recording.damage).replace(str(path), path.name)}")
+    notes += [
+        f"{quantity(count, 'message')} on {topic} left out, {reason}; of the last: {why}"
+        for (topic, reason), (count, why) in refused.items()
+    ]
     return tuple(notes)
 
 
@@ -88,10 +144,10 @@ def _bag_keypoints(
     topic: str | None,
     image_size: tuple[int, int] | None,
     rejections: dict[str, str],
-    refused: dict[str, tuple[int, str]],
+    refused: dict[tuple[str, str], tuple[int, str]],
     guessed: bool,
-) -> dict[str, list[msg_adapters.Keypoints2D]]:
-    """Return keypoint messages by topic.
+) -> dict[str, list[tuple[int, msg_adapters.Keypoints2D]]]:
+    """Return the log times (nanoseconds) and keypoints of messages by topic.
 
     Args:
         recording: the bag.
@@ -99,12 +155,12 @@ def _bag_keypoints(
         topic: that is read, with * for any part of a name; None reads all.
         image_size: width and height in pixels, if known.
         rejections: is given the last reason for which messages of a topic were rejected.
-        refused: is given the number of rejected messages by reason, and the last text.
+        refused: is given the number of rejected messages by topic and reason, and the last text.
         guessed: see ``read_bag``.
     """
     from paul_ros.offline.bag_reader import matches
 
-    frames: dict[str, list[msg_adapters.Keypoints2D]] = {}
+    frames: dict[str, list[tuple[int, msg_adapters.Keypoints2D]]] = {}
     for record in recording.whole_records():
         name, type_name = record.topic, record.type_name
         if type_name not in msg_adapters.SUPPORTED or not matches(name, topic or name):
@@ -115,43 +171,51 @@ def _bag_keypoints(
             keypoints = msg_adapters.read(type_name, record.message(), len(layout.names), source)
         except (BagError, msg_adapters.MessageError) as error:
             rejections[name] = str(error)
-            reason = error.reason if isinstance(error, msg_adapters.MessageError) else "undecodable"
-            refused[reason] = refused.get(reason, (0, ""))[0] + 1, str(error)
+            what = name, getattr(error, "reason", "undecodable")
+            refused[what] = refused.get(what, (0, ""))[0] + 1, str(error)
         else:
             if keypoints.persons:
-                frames.setdefault(topic or name, []).append(keypoints)
+                frames.setdefault(topic or name, []).append((record.log_time, keypoints))
     return frames
 
 
-def _bag_camera(path: Path) -> tuple[msg_adapters.Intrinsics | None, tuple[int, int] | None, dict[str, str]]:
-    """Return the camera, the size of its image, and rejected CameraInfo messages as reasons by topic.
+def _bag_cameras(path: Path, keypoints: str | None, given: str | None) -> _Cameras:
+    """Read the CameraInfo that replay would use.
 
     Cameras are read before the keypoints: some keypoints are shares of the image size, and the first of them may come
     before any CameraInfo.
     """
     from paul_ros.offline.bag_reader import Recording
+    from paul_ros.offline.bag_topics import choose_camera, topics_in
 
-    rejections: dict[str, str] = {}
-    cameras: set[msg_adapters.Intrinsics] = set()
+    topic = choose_camera(path, topics_in(path), given, keypoints)
+    found: list[tuple[int, msg_adapters.Intrinsics]] = []
     sizes: set[tuple[int, int]] = set()
-    for record in Recording(path).whole_records():
-        if record.type_name != "sensor_msgs/msg/CameraInfo":
-            continue
+    rejections: dict[str, str] = {}
+    for record in Recording(path).whole_records([topic]) if topic else ():
         try:
             info = record.message()
         except BagError as error:
             rejections[record.topic] = str(error)
             continue
-        # An uncalibrated camera has an image size too.
-        sizes.add((int(info.width), int(info.height)))
         try:
-            cameras.add(msg_adapters.read_camera_info(info))
+            # An uncalibrated camera has an image size too.
+            sizes.add(msg_adapters.image_size(info))
+            camera = msg_adapters.read_camera_info(info)
         except msg_adapters.MessageError as error:
             rejections[record.topic] = str(error)
-    count = max(len(cameras), len(sizes))
-    if count > 1:
-        raise DataError(f"'{path}' has CameraInfo of {count} cameras: keep that of the keypoints only")
-    return cameras.pop() if cameras else None, sizes.pop() if sizes else None, rejections
+            continue
+        if not found or found[-1][1] != camera:
+            found.append((record.log_time, camera))
+    if len(sizes) > 1 or not all(_same_camera(found[0][1], camera) for _, camera in found):
+        raise DataError(f"'{path}' has CameraInfo of several cameras on {topic}: keep that of the keypoints only")
+    return _Cameras(found, sizes.pop() if sizes else None, rejections)
+
+
+def _same_camera(one: msg_adapters.Intrinsics, other: msg_adapters.Intrinsics) -> bool:
+    """Return whether two intrinsics are those of one camera, whose calibration may be sent with jitter."""
+    difference = [abs(getattr(one, name) - getattr(other, name)) for name in ("fx", "fy", "cx", "cy")]
+    return max(difference) <= _JITTER * one.fx
 
 
 def _reasons(rejections: dict[str, str]) -> str:

@@ -22,6 +22,7 @@ def load_training_data(
     layout: Layout | None = None,
     topic: str | None = None,
     min_confidence: float = MIN_CONFIDENCE,
+    camera_info_topic: str | None = None,
 ) -> TrainingData:
     """Load 2D keypoints to train on.
 
@@ -34,6 +35,7 @@ def load_training_data(
         topic: of the keypoints, if the bag has several. It may have * for a part of its name, for families with one
             topic per person: /humans/bodies/*/skeleton2d.
         min_confidence: keypoints of a bag with a lower confidence count as hidden, as in the node.
+        camera_info_topic: of the camera of the keypoints, if the bag has several.
 
     Raises:
         DataError: nothing to train on, arrays that do not fit the layout, or values that are no image points.
@@ -45,4 +47,5 @@ def load_training_data(
     if path.suffix == ".npz":
         return checked(read_arrays(path, layout), path, guessed=layout is None)
     named = layout or load_layout(DEFAULT_LAYOUT)
-    return checked(read_bag(path, named, topic, min_confidence, guessed=layout is None), path, guessed=False)
+    raw = read_bag(path, named, topic, min_confidence, layout is None, camera_info_topic)
+    return checked(raw, path, guessed=False)

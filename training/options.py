@@ -20,6 +20,7 @@ class TrainingOptions:
         json: report that the caller writes, or None; here it is only checked.
         layout: of the points, name or YAML file; None: guessed.
         topic: of a bag's keypoints; None: the only one.
+        camera_info_topic: of a bag's camera; None: the only one.
         min_confidence: keypoints of a bag below it count as hidden.
         recipe: name or YAML file.
         overrides: ``key=value`` settings of the recipe.
@@ -37,6 +38,7 @@ class TrainingOptions:
     json: Path | None = None
     layout: str | None = None
     topic: str | None = None
+    camera_info_topic: str | None = None
     min_confidence: float = 0.3
     recipe: str = "default"
     overrides: tuple[str, ...] = ()

@@ -28,9 +28,10 @@ from paul_ros.layout import load_layout
 from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.offline.bag_reader import read_records
+from paul_ros.offline.bag_topics import Topics
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.judge import evaluate
-from paul_ros.offline.replay import Topics, replay
+from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import LiftStream
 
 # --- messages

@@ -115,15 +115,18 @@ def add_topics(parser: argparse.ArgumentParser) -> None:
     """Add the topics of keypoints and camera in a bag."""
     parser.add_argument(
         "--topic",
-        default="/keypoints",
         help="topic of the 2D keypoints; * matches any one part of a name, as in '/humans/bodies/*/skeleton2d' "
-        "(default: %(default)s)",
+        "(default: /keypoints, else the only topic of a type made for keypoints)",
     )
+    add_camera_info_topic(parser)
+
+
+def add_camera_info_topic(parser: argparse.ArgumentParser) -> None:
+    """Add --camera-info-topic, the camera of the keypoints."""
     parser.add_argument(
         "--camera-info-topic",
-        default="/camera_info",
         metavar="TOPIC",
-        help="topic of the camera; a bag without it gives model units (default: %(default)s)",
+        help="topic of the camera of the keypoints (default: the only CameraInfo of the bag)",
     )
 
 

@@ -73,15 +73,13 @@ def add_parser(commands: Commands) -> None:
     add_image(parser)
     parser.add_argument(
         "--depth-topic",
-        default="/depth",
         metavar="TOPIC",
-        help="topic of depth images aligned to the image of the keypoints (default: %(default)s)",
+        help="topic of depth images aligned to the image of the keypoints (default: /depth)",
     )
     parser.add_argument(
         "--ground-truth-topic",
-        default="/ground_truth/poses",
         metavar="TOPIC",
-        help="topic of the truth: PoseArray, metres, camera frame, person by person (default: %(default)s)",
+        help="topic of the truth: PoseArray, metres, camera frame, person by person (default: /ground_truth/poses)",
     )
     parser.set_defaults(run=run)
 
@@ -94,9 +92,10 @@ def run(args: argparse.Namespace) -> None:
     """
     from paul_ros.errors import BagError
     from paul_ros.extras import require
-    from paul_ros.offline.judge import evaluate
-    from paul_ros.offline.picture import write_picture
-    from paul_ros.offline.replay import Topics, replay
+    from paul_ros.offline.bag_topics import Topics
+    from paul_ros.offline.judge import Judge
+    from paul_ros.offline.picture import MOST_FRAMES, write_picture
+    from paul_ros.offline.replay import replay
     from paul_ros.offline.report import table
     from paul_ros.stream.stream import open_stream
 
@@ -105,13 +104,16 @@ def run(args: argparse.Namespace) -> None:
     check_suffix(args.plot, PICTURES)
     if args.json != STDOUT:
         require("bags", "rich")
-    topics = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
     names = ("output_layout", "person_height", "smoothing", "min_confidence", "max_persons", "image")
     parameters = {name: getattr(args, name) for name in names}
     stream = open_stream(args.model, args.layout, **parameters)
+    wanted = Topics(args.topic, args.camera_info_topic, args.ground_truth_topic, args.depth_topic)
+    topics = wanted.found_in(args.bag)
+    judge = Judge(stream, expects_truth=topics.truth is not None)
     with progress("replay") as count:
-        done = replay(args.bag, stream, args.output, topics, lambda: count(1))
-    report = evaluate(done)
+        kept = MOST_FRAMES if args.plot else 0
+        done = replay(args.bag, stream, args.output, topics, lambda: count(1), judge, kept)
+    report = judge.report(done)
     report["advice"] = {reason: in_options(text, vars(args)) for reason, text in report["advice"].items()}
     publish(report, table, args.json, (lambda: write_picture(args.plot, done)) if args.plot else None)
     written = [str(path) for path in (args.output, args.json, args.plot) if path]

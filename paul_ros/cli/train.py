@@ -8,7 +8,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_json, add_min_confidence
+from paul_ros.cli.options import Commands, HelpFormatter, add_camera_info_topic, add_json, add_min_confidence
 from paul_ros.cli.output import STDOUT, publish
 from paul_ros.extras import require
 
@@ -66,6 +66,7 @@ def run(args: argparse.Namespace) -> None:
             json=None if args.json == STDOUT else args.json,
             layout=args.layout,
             topic=args.topic,
+            camera_info_topic=args.camera_info_topic,
             min_confidence=args.min_confidence,
             recipe=args.recipe,
             overrides=tuple(args.set),
@@ -101,6 +102,7 @@ def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: coco17 for 17 points and for bags, else points without names)",
     )
     parser.add_argument("--topic", help="topic of the 2D keypoints, if a bag has several; * matches any part of a name")
+    add_camera_info_topic(parser)
     add_min_confidence(parser)
 
 

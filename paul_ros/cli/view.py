@@ -72,9 +72,9 @@ def run(args: argparse.Namespace) -> None:
     """
     from paul_ros.model_file import load_model
     from paul_ros.offline.bag_folder import is_bag
+    from paul_ros.offline.bag_topics import Topics
     from paul_ros.offline.film import view_bag
     from paul_ros.offline.film_model import view_model
-    from paul_ros.offline.replay import Topics
     from paul_ros.stream.stream import open_stream
 
     thing, damage = Path(args.thing), None

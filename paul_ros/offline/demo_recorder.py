@@ -10,21 +10,23 @@ from collections.abc import Callable
 from typing import BinaryIO
 
 from paul_ros.errors import DemoError
+from paul_ros.offline.bag_topics import CAMERA_INFO_TYPE
 from paul_ros.offline.bag_writer import LATCHED_QOS, BagWriter
 from paul_ros.offline.processes import tail
-from paul_ros.offline.replay import CAMERA_INFO, NODE_NAME, POSE_ARRAY
+from paul_ros.offline.replay import NODE_NAME
 
 _CLOUD = "sensor_msgs/msg/PointCloud2"
+_POSES = "geometry_msgs/msg/PoseArray"
 
 #: Topics that the player publishes -> their types.
-PLAYED = {"/camera_info": CAMERA_INFO, "/keypoints": _CLOUD}
+PLAYED = {"/camera_info": CAMERA_INFO_TYPE, "/keypoints": _CLOUD}
 
 #: Topics that the recorder writes -> their types.
 RECORDED = {
     **PLAYED,
     f"{NODE_NAME}/layout": "std_msgs/msg/String",
-    f"{NODE_NAME}/poses": POSE_ARRAY,
-    f"{NODE_NAME}/bodies": POSE_ARRAY,
+    f"{NODE_NAME}/poses": _POSES,
+    f"{NODE_NAME}/bodies": _POSES,
     f"{NODE_NAME}/persons": "sensor_msgs/msg/MultiDOFJointState",
     f"{NODE_NAME}/keypoints3d": _CLOUD,
     f"{NODE_NAME}/markers": "visualization_msgs/msg/MarkerArray",

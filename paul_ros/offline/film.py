@@ -5,17 +5,19 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from paul_ros.errors import BagError, PictureError
+from paul_ros.offline.bag_topics import Topics
 from paul_ros.offline.film_excerpt import Excerpt
 from paul_ros.offline.film_files import check_format, write_film
 from paul_ros.offline.film_stage import Stage
-from paul_ros.offline.replay import Replay, Topics, replay
+from paul_ros.offline.replay import Replay, replay
 from paul_ros.stream.stream import LiftStream
+from paul_ros.wording import quantity
 
 #: Pictures of a film that is a .png.
 PNG_PICTURES = 4
@@ -67,18 +69,30 @@ def view_bag(
         PictureError: nobody was lifted, or the film cannot be written.
     """
     check_format(out)
-    excerpt = Excerpt.choose(bag, topics, start, seconds)
+    found = topics.found_in(bag)
+    excerpt = Excerpt.choose(bag, found, start, seconds)
     with tempfile.TemporaryDirectory() as folder:
         part = Path(folder) / "part.mcap"
-        excerpt.copy(bag, part, topics)
-        done = replay(part, stream, topics=topics)
+        excerpt.copy(bag, part, found)
+        done = replay(part, stream, topics=found)
     if not any(frame.lifted.ok.any() for frame in done.frames):
         why = " ".join(done.drop_advice) or "no message shows a person"
         raise PictureError(f"{bag}: nobody was lifted, so there is nothing to draw: {why}")
-    stage = Stage.of(done, bag.stem, excerpt.first)
-    shown = _png_frames(done) if out.suffix == ".png" else range(len(done.frames))
+    drawn = _in_one_unit(done)
+    first = excerpt.first + (drawn.frames[0].stamp - done.frames[0].stamp) / 1e9
+    stage = Stage.of(drawn, bag.stem, first)
+    shown = _png_frames(drawn) if out.suffix == ".png" else range(len(drawn.frames))
     write_film(out, progress((stage.draw(index) for index in shown), len(shown)))
-    return Film(out, len(shown), excerpt.summary(len(shown))), excerpt.damage
+    summary = excerpt.summary(len(shown))
+    if left_out := len(done.frames) - len(drawn.frames):
+        summary += f", {quantity(left_out, 'frame')} without metres left out"
+    return Film(out, len(shown), summary), excerpt.damage
+
+
+def _in_one_unit(done: Replay) -> Replay:
+    """Return a replay without the frames in model units, if others are in metres: one room cannot show both."""
+    metric = [frame for frame in done.frames if frame.lifted.units == "m"]
+    return replace(done, frames=metric) if any(frame.lifted.ok.any() for frame in metric) else done
 
 
 def _png_frames(done: Replay) -> list[int]:

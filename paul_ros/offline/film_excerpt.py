@@ -12,9 +12,9 @@ from msg_adapters import ONE_PERSON
 from paul_ros.errors import BagError
 from paul_ros.offline.bag_reader import matches, read_records
 from paul_ros.offline.bag_records import Record
+from paul_ros.offline.bag_topics import BagTopics
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.film_files import PICTURES_PER_SECOND
-from paul_ros.offline.replay import Topics, no_keypoints
 from paul_ros.wording import quantity
 
 #: Most pictures of a film; a longer bag is shown in larger steps.
@@ -47,12 +47,12 @@ class Excerpt:
     damage: BagError | None
 
     @classmethod
-    def choose(cls, bag: Path, topics: Topics, start: float, seconds: float | None) -> Excerpt:
+    def choose(cls, bag: Path, topics: BagTopics, start: float, seconds: float | None) -> Excerpt:
         """Choose up to MAX_PICTURES images.
 
         Args:
             bag: an .mcap file or a rosbag2 folder.
-            topics: names of the topics to read.
+            topics: of the bag.
             start: seconds from the bag's first keypoints.
             seconds: length of the part; None = to the end.
 
@@ -63,7 +63,7 @@ class Excerpt:
         since = (times - times[:1]) / 1e9
         wanted = np.flatnonzero((since >= start) & (since <= start + (np.inf if seconds is None else seconds)))
         if not len(times):
-            raise BagError(no_keypoints(bag, topics))
+            raise BagError(f"{bag}: no message on {topics.keypoints} can be read")
         if not len(wanted):
             raise BagError(_empty_part(bag, since, start, seconds))
         first, last = since[wanted[0]], since[wanted[-1]]
@@ -76,7 +76,7 @@ class Excerpt:
         speed = step * PICTURES_PER_SECOND
         return cls(frozenset(chosen.tolist()), len(times), first, last, since[-1], speed, damage)
 
-    def copy(self, bag: Path, part: Path, topics: Topics) -> None:
+    def copy(self, bag: Path, part: Path, topics: BagTopics) -> None:
         """Write the chosen messages to a bag, with the latest message of each other topic before each of them."""
         waiting: dict[str, Record] = {}
         with BagWriter(part) as writer:
@@ -102,7 +102,7 @@ class Excerpt:
         )
 
 
-def _keypoint_times(bag: Path, topics: Topics) -> tuple[np.ndarray, bool, BagError | None]:
+def _keypoint_times(bag: Path, topics: BagTopics) -> tuple[np.ndarray, bool, BagError | None]:
     """Return the log times of all keypoint messages in ns, whether each holds one person, and a bag's damage."""
     times, one_person = [], False
     try:

@@ -13,9 +13,10 @@ import numpy as np
 from paul_ros import metrics
 from paul_ros.errors import PictureError
 from paul_ros.offline.figures import new_figure, save_figure
-from paul_ros.offline.judge import MIN_TRUTH_POINTS, match_truth, rigid_frames
+from paul_ros.offline.judge import rigid_frames
 from paul_ros.offline.replay import LiftedFrame, Replay
 from paul_ros.offline.skeleton_drawing import draw_skeleton
+from paul_ros.offline.truth_errors import MIN_TRUTH_POINTS, match_truth
 from paul_ros.stream.messages import image_pixels
 
 _TRUTH_COLOUR = "#c4c4c4"
@@ -23,6 +24,9 @@ _LIFTED_COLOUR, _N_MPJPE_COLOUR, _RIGID_COLOUR = "#2a9d50", "#f0a030", "#9a9a9a"
 #: Name of a row -> the axis of the camera frame that runs to the right.
 _PROJECTIONS = (("seen by the camera", 0), ("seen from the right, camera at the left", 2))
 _MAX_PANEL = 3.6  # inches, width and height
+
+#: Number of frames that a replay needs to keep for a picture; up to the double is drawn.
+MOST_FRAMES = 2000
 
 
 def write_picture(path: str | Path, done: Replay) -> None:

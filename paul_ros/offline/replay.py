@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-import msg_adapters
 from msg_adapters import Intrinsics, Keypoints2D
 from msg_adapters.keypoints import stamp_ns
 from paul_ros.errors import BagError, WrongTopicError
 from paul_ros.layout import Layout
 from paul_ros.lifted import Lifted
-from paul_ros.offline import truth_units
-from paul_ros.offline.bag_reader import matches, read_records, topics_of
+from paul_ros.offline.bag_reader import matches, read_records
 from paul_ros.offline.bag_records import BagMessages, Record
+from paul_ros.offline.bag_topics import CAMERA_INFO, DEPTH, KEYPOINTS, TRUTH, BagTopics, Role, Topics
 from paul_ros.offline.bag_writer import LATCHED_QOS, BagWriter
 from paul_ros.output_files import check_outputs
 from paul_ros.stream.frame import Frame
@@ -34,40 +33,7 @@ from paul_ros.stream.stream import LiftStream
 #: Name of the replayed node; output topics lie below it, as those of the live node do.
 NODE_NAME = "/lifter"
 
-CAMERA_INFO, POSE_ARRAY = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseArray"
-DEPTH_IMAGE = "sensor_msgs/msg/Image"
-
-#: Role of a topic -> the option of `paul replay` that chooses it.
-_OPTIONS = {
-    "keypoints": "--topic",
-    "camera info": "--camera-info-topic",
-    "ground truth": "--ground-truth-topic",
-    "depth": "--depth-topic",
-}
 _MAX_COORDINATE = 1e9  # metres; a ground truth beyond this, or not a number, is missing
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Names of the topics to read; the defaults are those of the bags in bags/.
-
-    Attributes:
-        keypoints: 2D keypoints. * stands for one part of the name, for message families with a topic per person:
-            /humans/bodies/*/skeleton2d.
-        camera_info: CameraInfo.
-        truth: ground truth, PoseArray in metres in the camera frame, person by person in the input's layout.
-        depth: depth images aligned to the image of the keypoints.
-    """
-
-    keypoints: str = "/keypoints"
-    camera_info: str = "/camera_info"
-    truth: str = "/ground_truth/poses"
-    depth: str = "/depth"
-
-    @property
-    def all(self) -> tuple[str, ...]:
-        """All four names."""
-        return self.keypoints, self.camera_info, self.truth, self.depth
 
 
 @dataclass(frozen=True)
@@ -89,6 +55,16 @@ class LiftedFrame:
     camera: Intrinsics | None
 
 
+class Listener(Protocol):
+    """Receives the frames and the ground truth of a replay as they come, in the order of the bag."""
+
+    def add_frame(self, frame: LiftedFrame) -> None:
+        """Take a lifted message."""
+
+    def add_truth(self, stamp: int, points: np.ndarray) -> None:
+        """Take the ground truth of a stamp, (N,P,3) metres in the output's layout."""
+
+
 @dataclass
 class Replay:
     """A replayed bag.
@@ -96,7 +72,8 @@ class Replay:
     Attributes:
         bag: path of the bag.
         stream: the stream that lifted it, with its counts and drops.
-        frames: lifted messages in the order of the bag.
+        topics: the topics that were read.
+        frames: the kept messages in the order of the bag.
         truth: stamp -> (N,P,3) metres, camera frame, in the output's layout. Row i is the person of row i of the
             keypoints of that stamp. Points without a ground truth are NaN.
         damage: error of a damaged bag, whose messages before the damage are here; None = the bag is whole.
@@ -104,6 +81,7 @@ class Replay:
 
     bag: Path
     stream: LiftStream
+    topics: BagTopics
     frames: list[LiftedFrame] = field(default_factory=list)
     truth: dict[int, np.ndarray] = field(default_factory=dict)
     damage: BagError | None = None
@@ -125,6 +103,8 @@ def replay(
     out: Path | None = None,
     topics: Topics = Topics(),
     on_frame: Callable[[], None] = lambda: None,
+    listener: Listener | None = None,
+    keep: int | None = None,
 ) -> Replay:
     """Lift every keypoint message of a bag.
 
@@ -136,21 +116,26 @@ def replay(
         out: bag to write, with the input topics and the outputs below NODE_NAME; None = write none.
         topics: names of the topics to read.
         on_frame: called after each keypoint message.
+        listener: receives all frames and all ground truth.
+        keep: number of frames to keep in the result, evenly over the bag, up to the double; None = all.
 
     Returns:
-        The lifted frames, the ground truth, and the error of a damaged bag.
+        The kept frames, their ground truth, and the error of a damaged bag.
 
     Raises:
-        BagError: no message can be read, or none is on the keypoint topic.
+        BagError: no message can be read, none is on the keypoint topic, or a topic cannot be chosen.
         WrongTopicError: a topic has a type that cannot be read in its role.
         OutputError: `out` cannot be written, or would overwrite the bag.
     """
     check_outputs([out], [bag])
-    done = Replay(bag, stream)
+    found = topics.found_in(bag)
+    kept = _KeptFrames(keep)
+    listeners = [kept, listener] if listener else [kept]
+    done = Replay(bag, stream, found)
     with BagWriter(out) if out else contextlib.nullcontext() as writer:
-        node = _OfflineNode(done, topics, writer)
+        node = _OfflineNode(stream, found, writer, listeners)
         try:
-            for record in read_records(bag, topics.all):
+            for record in read_records(bag, found.all):
                 if node.take(record):
                     on_frame()
             node.finish()
@@ -158,24 +143,66 @@ def replay(
             raise
         except BagError as error:
             node.finish()
-            if not done.frames:
+            if not stream.counts["frames"]:
                 raise
             done.damage = error
-        if not node.keypoint_messages:
-            raise BagError(no_keypoints(bag, topics))
+    done.frames, done.truth = kept.frames, kept.truth
     return done
 
 
-class _OfflineNode:
-    """The node's counterpart: hands records to the stream and its outputs to the writer."""
+class _KeptFrames:
+    """Keeps frames and their ground truth, all or evenly over the bag.
 
-    def __init__(self, done: Replay, topics: Topics, writer: BagWriter | None) -> None:
-        self.done, self.topics, self.writer = done, topics, writer
-        self.keypoint_messages = 0
+    Attributes:
+        frames: every frame, or every second, fourth, ... so that they are at most the double of the wanted number.
+        truth: stamp -> (N,P,3) of the kept frames, and of stamps whose frames may still come.
+    """
+
+    def __init__(self, wanted: int | None) -> None:
+        self.frames: list[LiftedFrame] = []
+        self.truth: dict[int, np.ndarray] = {}
+        self._wanted = wanted
+        self._step, self._seen, self._last = 1, 0, -1
+        self._stamps: set[int] = set()
+
+    def add_frame(self, frame: LiftedFrame) -> None:
+        """Keep a frame if it is one of those, and thin the kept ones if they become too many."""
+        self._seen += 1
+        self._last = frame.stamp
+        if (self._seen - 1) % self._step or self._wanted == 0:
+            if frame.stamp not in self._stamps:
+                self.truth.pop(frame.stamp, None)
+            return
+        self.frames.append(frame)
+        self._stamps.add(frame.stamp)
+        if self._wanted is not None and len(self.frames) > 2 * self._wanted:
+            self._thin()
+
+    def add_truth(self, stamp: int, points: np.ndarray) -> None:
+        """Keep a ground truth unless its frame has come and was not kept."""
+        if self._wanted is None or stamp in self._stamps or (stamp > self._last and self._wanted):
+            self.truth[stamp] = points
+
+    def _thin(self) -> None:
+        self.frames, self._step = self.frames[::2], 2 * self._step
+        self._stamps = {frame.stamp for frame in self.frames}
+        self.truth = {
+            stamp: points for stamp, points in self.truth.items() if stamp in self._stamps or stamp > self._last
+        }
+
+
+class _OfflineNode:
+    """The node's counterpart: hands records to the stream, its outputs to the writer, and its frames to listeners."""
+
+    def __init__(
+        self, stream: LiftStream, topics: BagTopics, writer: BagWriter | None, listeners: Sequence[Listener]
+    ) -> None:
+        self.stream, self.topics, self.writer, self.listeners = stream, topics, writer, listeners
         self._make = BagMessages()
         self._builder = MessageBuilder(self._make)
         self._described: dict = {}
-        self._flat_truth: dict[int, np.ndarray] = {}  # stamp -> (N*P,3) in the input's layout
+        self._early_truth: list[tuple[int, np.ndarray]] = []  # stamp and (N*P,3) while the input's layout is unknown
+        self._layout_known = False
         self._last_time = 0
 
     def take(self, record: Record) -> bool:
@@ -186,59 +213,51 @@ class _OfflineNode:
             self._take_keypoints(record)
             return True
         if record.topic == self.topics.camera_info:
-            self._decode(record, "camera info", self.done.stream.camera_info, CAMERA_INFO)
+            self._decode(record, CAMERA_INFO, self.stream.camera_info)
         elif record.topic == self.topics.depth:
-            self._decode(record, "depth", self.done.stream.depth, DEPTH_IMAGE)
+            self._decode(record, DEPTH, self.stream.depth)
         else:
-            self._decode(record, "ground truth", self._take_truth, POSE_ARRAY)
+            self._decode(record, TRUTH, self._take_truth)
         return False
 
     def finish(self) -> None:
-        """Lift the persons that still wait for others of their image, and map the ground truth to the output's layout.
+        """Lift the persons that still wait for others of their image."""
+        self._take_frame(self.stream.flush())
+        self._pass_early_truth()
 
-        The layout of the input, and so that of the truth, is certain only now.
-        """
-        self._take_frame(self.done.stream.flush())
-        for stamp, flat in self._flat_truth.items():
-            self._map_truth(stamp, flat)
-        if problem := truth_units.problem(self.done):
-            self.done.stream.ledger.drop("truth_not_metres", problem, len(self.done.truth))
-            self.done.truth.clear()
-
-    def _decode(self, record: Record, role: str, take: Callable[[Any], None], *readable: str) -> None:
+    def _decode(self, record: Record, role: Role, take: Callable[[Any], None]) -> None:
         """Decode a record for `take`; count undecodable bytes as a drop.
 
         Raises:
-            WrongTopicError: the topic's type is not one of `readable`.
+            WrongTopicError: the topic's type cannot be read in its role.
         """
-        if record.type_name not in readable:
-            raise WrongTopicError(
-                f"{record.topic} is a {record.type_name}, not readable as {role} ({' or '.join(readable)} is): "
-                f"choose another with {_OPTIONS[role]}"
-            )
+        role.check(record.topic, record.type_name)
         try:
             message = record.message()
         except BagError as error:
-            self.done.stream.ledger.drop("undecodable", str(error))
+            self.stream.ledger.drop("undecodable", str(error))
         else:
             take(message)
 
     def _take_keypoints(self, record: Record) -> None:
-        self.keypoint_messages += 1
         self._last_time = record.log_time
-        self._decode(record, "keypoints", lambda message: self._lift(record, message), *msg_adapters.SUPPORTED)
+        self._decode(record, KEYPOINTS, lambda message: self._lift(record, message))
 
     def _lift(self, record: Record, message: Any) -> None:
-        answer = self.done.stream.keypoints(record.type_name, message, record.topic, record.log_time)
-        self._write_layout(record.log_time)
+        answer = self.stream.keypoints(record.type_name, message, record.topic, record.log_time)
+        described = self.stream.describe()
+        self._write_layout(described, record.log_time)
+        if not self._layout_known and described["input_layout"]:
+            self._pass_early_truth()
+            self._layout_known = True
         self._take_frame(answer.frame)
 
     def _take_frame(self, frame: Frame | None) -> None:
         if frame is None:
             return
-        camera = self.done.stream.intrinsics
-        stamp = frame.keypoints.stamp
-        self.done.frames.append(LiftedFrame(stamp, frame.keypoints, frame.lifted, frame.given, camera))
+        lifted = LiftedFrame(frame.keypoints.stamp, frame.keypoints, frame.lifted, frame.given, frame.camera)
+        for listener in self.listeners:
+            listener.add_frame(lifted)
         if self.writer:
             for name, message in self._builder.messages(frame).items():
                 self.writer.write(f"{NODE_NAME}/{name}", message, self._last_time)
@@ -246,29 +265,29 @@ class _OfflineNode:
     def _take_truth(self, message: Any) -> None:
         flat = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses], float).reshape(-1, 3)
         flat[~(np.abs(flat) < _MAX_COORDINATE).all(axis=1)] = np.nan
-        self._flat_truth[stamp_ns(message.header)] = flat
+        stamp = stamp_ns(message.header)
+        if self._layout_known:
+            self._pass_truth(stamp, flat)
+        else:
+            self._early_truth.append((stamp, flat))
 
-    def _map_truth(self, stamp: int, flat: np.ndarray) -> None:
-        route = self.done.stream.route
-        points = len(route.given.names)
+    def _pass_early_truth(self) -> None:
+        for stamp, flat in self._early_truth:
+            self._pass_truth(stamp, flat)
+        self._early_truth.clear()
+
+    def _pass_truth(self, stamp: int, flat: np.ndarray) -> None:
+        """Map a ground truth (N*P,3) to the output's layout and hand it on; a wrong number of points is a drop."""
+        points = len(self.stream.route.given.names)
         if len(flat) % points:
-            self.done.stream.ledger.drop("truth_wrong_point_count", REASONS["truth_wrong_point_count"].advice)
+            self.stream.ledger.drop("truth_wrong_point_count", REASONS["truth_wrong_point_count"].advice)
             return
-        self.done.truth[stamp] = route.points_out(flat.reshape(-1, points, 3))
+        for listener in self.listeners:
+            listener.add_truth(stamp, self.stream.route.points_out(flat.reshape(-1, points, 3)))
 
-    def _write_layout(self, log_time: int) -> None:
+    def _write_layout(self, described: dict[str, Any], log_time: int) -> None:
         """Write ~/layout whenever it changes, as the node does."""
-        described = self.done.stream.describe()
         if self.writer and described != self._described:
             self._described = described
             message = self._make("std_msgs/msg/String", data=json.dumps(described))
             self.writer.write(f"{NODE_NAME}/layout", message, log_time, LATCHED_QOS)
-
-
-def no_keypoints(bag: Path, topics: Topics) -> str:
-    """Return the error for a bag without messages on the topic of the keypoints: what it holds, and what to do."""
-    held = [f"{topic} ({kind})" for topic, (kind, _) in topics_of(bag).items()]
-    return (
-        f"{bag}: no messages on {topics.keypoints}; the bag holds {', '.join(held) or 'none at all'}. "
-        "Choose one with --topic"
-    )

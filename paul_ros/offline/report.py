@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from paul_ros.offline.tables import Cell, Row, cell, figure, render
+from paul_ros.wording import quantity
 
 _ERROR_ROWS = (
     ("N-MPJPE", "n_mpjpe_mm", "mm"),
@@ -33,7 +34,13 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
         f"  {report['frames']} frames, {report['persons']} persons, {report['lifted']} lifted; dropped: {dropped}",
         f"  model {report['model']} ({report['model_sha256'][:12]}), layout {report['layout']}, "
         f"units {report['units']}",
+        f"  keypoints {report['keypoints_topic']}, camera {report['camera_info_topic'] or 'none in the bag'}",
     ]
+    if report["units"] == "mixed":
+        without = quantity(report["frames_without_metres"], "frame")
+        lines.append(
+            f"  {without} without metres, before the first usable CameraInfo: left out of NE, root and distance errors"
+        )
     advice = report["advice"]
     lines += [f"  noted: {count} {what}: {advice[what]}" for what, count in report["noted"].items() if what in advice]
     lines.append("")
@@ -52,33 +59,27 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
 
 def _errors(report: dict, name: str, key: str) -> tuple[Cell, Cell]:
     """Return an error of the lifted persons and of the rigid mean shape."""
-    if report["units"] == "m":
-        why = "the ground truth has no root, or persons were lifted before the first CameraInfo"
-    else:
-        why = f"metres are needed; {report['scale_source'].removeprefix('none: ')}"
+    why = report["unavailable"].get(key, "the rigid mean shape could not be lifted")
     return figure(report[key], name, why), figure(report["baseline"][key], name, why)
 
 
 def _figures(report: dict) -> list[Row]:
     """Return the rows that need no truth: name, figure, "", unit."""
-    nobody = "nobody was lifted"
-    flips = "no person with an id was lifted in two successive frames; use tracked keypoints"
-    times = (report[key] for key in ("lift_us_median", "lift_us_p99"))
-    lift, lift_p99 = (figure(time, "lift, median", "no message shows a person") for time in times)
     rows = (
-        ("reprojection, median", report["reprojection_median_px"], nobody, "px"),
-        ("proven optimal", _percent(report["certified_share"]), nobody, "%"),
-        ("mirror ambiguous", _percent(report["ambiguous_share"]), nobody, "%"),
-        (
-            "flips in depth",
-            report["flips_per_1000_frames"],
-            flips if report["lifted"] else nobody,
-            "per 1000 pairs of frames",
-        ),
+        ("reprojection, median", "reprojection_median_px", 1, "px"),
+        ("proven optimal", "certified_share", 100, "%"),
+        ("mirror ambiguous", "ambiguous_share", 100, "%"),
+        ("flips in depth", "flips_per_1000_frames", 1, "per 1000 pairs of frames"),
+        ("lift, median", "lift_us_median", 1, f"µs per frame (99 %: {cell(report['lift_us_p99'])})"),
     )
     return [
-        *((name, figure(value, name, why), "", unit) for name, value, why, unit in rows),
-        ("lift, median", lift, "", f"µs per frame (99 %: {cell(lift_p99)})"),
+        (
+            name,
+            figure(None, name, report["unavailable"][key]) if report[key] is None else factor * report[key],
+            "",
+            unit,
+        )
+        for name, key, factor, unit in rows
     ]
 
 
@@ -86,7 +87,3 @@ def _who_is_judged(report: dict) -> str:
     judged, persons, share = (report[key] for key in ("persons_with_truth", "persons", "points_with_truth_share"))
     points = "" if share == 1 else f", over {100 * share:.0f} % of their points"
     return f"errors of {judged} of {persons} persons, {100 * (1 - judged / persons):.1f} % left out{points}"
-
-
-def _percent(share: float | None) -> float | None:
-    return None if share is None else 100 * share

@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
-from paul_ros.lifted import MAX_DISTANCE
-
-if TYPE_CHECKING:
-    from paul_ros.offline.replay import Replay
+from paul_ros.lifted import MAX_DISTANCE, Lifted
 
 _FACTOR = 8.0
 """Ratio of the sizes of truth and lifted persons beyond which their units differ. Children are not that small."""
@@ -21,9 +18,13 @@ _LEAST_POINTS = 4
 _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres or pixels"))
 
 
-def problem(done: Replay) -> str:
-    """Return why the ground truth of a replay is not in metres; '' if it may be."""
-    ratio = _ratio(done)
+def problem(ratios: Sequence[float]) -> str:
+    """Return why the ground truth of a bag is not in metres; '' if it may be.
+
+    Args:
+        ratios: `size_ratios` of all its persons.
+    """
+    ratio = float(np.median(ratios)) if len(ratios) else 1.0
     if not 0 < ratio or 1 / _FACTOR <= ratio <= _FACTOR:
         return ""
     guess = next((f" It looks like {name}." for size, name in _UNITS if size / 3 < ratio < 3 * size), "")
@@ -33,20 +34,17 @@ def problem(done: Replay) -> str:
     )
 
 
-def _ratio(done: Replay) -> float:
-    """Return the median size of the truth over that of the lifted persons in metres; 1 if either is unknown."""
-    metres = done.stream.lifter.metres_per_unit
-    ratios = []
-    for frame in done.frames:
-        lifted, truth = frame.lifted, done.truth.get(frame.stamp)
-        if truth is None or len(truth) != len(lifted.points):
-            continue
-        unit = 1.0 if lifted.units == "m" else metres
-        for points, true in zip(lifted.points[lifted.ok], truth[lifted.ok]):
-            known = np.isfinite(true).all(1)
-            if known.sum() >= _LEAST_POINTS:
-                ratios.append(_size_ratio(true[known], points[known], unit))
-    return float(np.median(ratios)) if ratios else 1.0
+def size_ratios(lifted: Lifted, truth: np.ndarray, metres_per_unit: float | None) -> list[float]:
+    """Return the sizes of the ground truth (N,P,3) over those of the lifted persons in metres, as far as known."""
+    if len(truth) != len(lifted.points):
+        return []
+    unit = 1.0 if lifted.units == "m" else metres_per_unit
+    known = np.isfinite(truth).all(2)
+    return [
+        _size_ratio(true[seen], points[seen], unit)
+        for points, true, seen, ok in zip(lifted.points, truth, known, lifted.ok)
+        if ok and seen.sum() >= _LEAST_POINTS
+    ]
 
 
 def _size_ratio(true: np.ndarray, points: np.ndarray, unit: float | None) -> float:
