@@ -379,3 +379,23 @@ def test_the_report_goes_to_standard_output(tmp_path, capsys):
     words += ["--set", "steps=2", "--quiet", "--json", "-"]
     assert main(["train", *map(str, words)]) == 0
     assert json.loads(capsys.readouterr().out)["restarts"][0]["chosen"]
+
+
+def test_a_damaged_bag_is_trained_on_as_far_as_replay_reads_it(tmp_path):
+    """Its whole messages are used, and what is lost stands in the notes, without the folders of this machine."""
+    half = tmp_path / "half.mcap"
+    half.write_bytes(BAG.read_bytes()[: BAG.stat().st_size // 2])
+    data = load_training_data(half, COCO)
+    replayed = replay(half, open_stream("human"))
+    assert len(data.used) == replayed.stream.counts["persons"] > 100
+    [note] = data.notes
+    assert "half.mcap: damaged: the file ends too early" in note and str(tmp_path) not in note
+
+
+def test_messages_that_do_not_decode_are_left_out_and_noted(tmp_path):
+    path = tmp_path / "odd.mcap"
+    with BagWriter(path) as bag:
+        for number, record in enumerate(read_records(BAG, ["/keypoints"])):
+            bag.write_record(replace(record, data=record.data[:50]) if number % 10 == 0 else record)
+    data = load_training_data(path, COCO)
+    assert len(data.used) == 526 and "'odd.mcap' are left out; refused on /keypoints" in data.notes[0]
