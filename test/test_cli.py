@@ -244,7 +244,7 @@ def test_half_a_bag(model_file, tmp_path):
         (["replay", ONE, "--topic", "/skeletons"], "no messages on /skeletons"),
         (["replay", ONE, "--topic", "/camera_info"], "/camera_info is a sensor_msgs/msg/CameraInfo, not readable"),
         (["replay", ONE, "-o", "/proc/nothing/out.mcap"], "cannot write"),
-        (["inspect", "zzz"], "no model or layout 'zzz'. Shipped models: human; shipped layouts: body25"),
+        (["inspect", "zzz"], "no model or layout 'zzz'. Shipped models: human; shipped layouts: ap10k17"),
         (["inspect", "coc17"], "no model or layout 'coc17', did you mean layout 'coco17'?"),
         (["inspect", "hunam"], "did you mean model 'human'?"),
         (["inspect", "nowhere.npz"], "no model 'nowhere.npz'"),
