@@ -19,12 +19,12 @@ from paul_ros.offline.bag_writer import BagWriter
 ONE = Path(__file__).resolve().parent.parent / "bags" / "one_person.mcap"
 
 
-def renamed(path: Path, *names: tuple[str, str], count: int = 90) -> Path:
+def renamed(path: Path, *names: tuple[str, str], later: int = 0) -> Path:
     """The first records of the shipped bag, each once under every new name of its topic."""
     with BagWriter(path) as writer:
-        for _, record in zip(range(count), read_records(ONE)):
+        for _, record in zip(range(90), read_records(ONE)):
             for name in [new for old, new in names if old == record.topic] or [record.topic]:
-                writer.write_record(replace(record, topic=name))
+                writer.write_record(replace(record, topic=name, log_time=record.log_time + later))
     return path
 
 
@@ -139,7 +139,7 @@ def test_a_bag_without_a_summary_is_read_whole(tmp_path):
     cut.parent.mkdir()
     cut.write_bytes(ONE.read_bytes()[:300_000])
     assert topics_in(cut) == topics_in(ONE)
-    renamed(tmp_path / "bag" / "bag_1.mcap", ("/camera_info", "/second/camera_info"))
+    renamed(tmp_path / "bag" / "bag_1.mcap", ("/camera_info", "/second/camera_info"), later=20 * 10**9)
     assert set(topics_in(cut.parent)) == {*topics_in(ONE), "/second/camera_info"}
 
 
