@@ -443,6 +443,15 @@ def test_yolo_places_points_by_their_one_based_id(bag_make):
     assert got.ids == ("4", "")
 
 
+def test_yolo_of_more_points_than_coco_needs_the_layout(make):
+    """A hand of 21 points fits the first 21 points of every larger layout."""
+    msg = detections_of(make, [("1", [(21, 50.0, 51.0, 0.5), (1, 10.0, 11.0, 0.9)])])
+    with pytest.raises(UnknownLayout, match="id 21 is beyond COCO's 17"):
+        read(YOLO, msg, 43, Source(candidates=(17, 25, 43)))
+    for source in (Source(), Source(candidates=(17, 21))):
+        assert read(YOLO, msg, 21, source).visible.sum() == 2
+
+
 def test_yolo_person_without_keypoints_and_nobody(bag_make):
     assert not read(YOLO, detections_of(bag_make, [("1", [])]), P).visible.any()
     assert read(YOLO, detections_of(bag_make, []), P).xy.shape == (0, P, 2)
