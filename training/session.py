@@ -67,8 +67,11 @@ def train(job: Job) -> Results | None:
         if options.fresh and is_first():
             _delete_runs(job.folders)
         _introduce(data)
-        runs = train_restarts(data, recipe, options.run_folder, device, lambda trainer: _watch(trainer, options))
-        return _write_results(runs, options) if is_first() else None
+        try:
+            runs = train_restarts(data, recipe, options.run_folder, device, lambda trainer: _watch(trainer, options))
+            return _write_results(runs, options) if is_first() else None
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(str(stop) or "stopped: the same command continues") from None
 
 
 def _loaded(job: Job, device: torch.device) -> tuple[TrainingData, Recipe]:
