@@ -32,7 +32,7 @@ from paul_ros.lifter import Lifter
 from paul_ros.model_file import load_model
 from paul_ros.stream.stream import LiftStream
 
-CASES = {"fields": 200, "junk": 100, "cdr": 200, "bags": 25, "recordings": 60, "models": 50, "layouts": 50}
+CASES = {"fields": 200, "junk": 100, "cdr": 200, "bags": 25, "recordings": 50, "models": 50, "layouts": 50}
 
 
 @pytest.fixture(scope="module")
