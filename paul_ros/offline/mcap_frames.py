@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from typing import TYPE_CHECKING, BinaryIO
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89MCAP0\r\n"
 
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS, DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0B, 0x0F
+FOOTER, SCHEMA, CHANNEL, MESSAGE = 0x02, 0x03, 0x04, 0x05
+CHUNK, MESSAGE_INDEX, STATISTICS, DATA_END = 0x06, 0x07, 0x0B, 0x0F
 """Opcodes of records."""
 
 FRAME = struct.Struct("<BQ")
@@ -92,7 +93,7 @@ class Frames:
             frame = self._frame(at)
             if frame is None or frame[0] == FOOTER:
                 self.problems.append(self._what_is_wrong(at))
-                found = self._search(at + 1)
+                found = self._search(at)
                 if found is None:
                     return None
                 at = found
@@ -130,16 +131,24 @@ class Frames:
             return "the file ends too early, or the length of a record is damaged"
         return f"no record begins at byte {at}"
 
-    def _search(self, start: int) -> int | None:
-        """Return the place of the next record from which the walk can go on.
+    def _search(self, at: int) -> int | None:
+        """Return the place of the next record behind a damaged one from which the walk can go on.
 
-        Chunks without compression hold frames too, but their checksum is that of the whole chunk. So a file with chunks
-        goes on at a chunk.
+        Chunks without compression hold frames too, but their checksum is that of the whole chunk. So the walk of a file
+        with chunks, or with their indices, goes on at a chunk.
         """
-        chunked = any(block.chunk for block in self.blocks)
+        self._stream.seek(at)
+        chunked = self._stream.read(1) == bytes([CHUNK]) or any(block.chunk for block in self.blocks)
+        start = at + 1
+        if chunked or self._next(start, (CHUNK, MESSAGE_INDEX)) is not None:
+            return self._next(start, (CHUNK, DATA_END))
+        return self._next(start, (SCHEMA, CHANNEL, MESSAGE, DATA_END))
+
+    def _next(self, start: int, opcodes: Collection[int]) -> int | None:
+        """Return the place of the next record of some kinds."""
         for place in self._possible_frames(start):
             frame = self._frame(place)
-            if frame and (frame[0] in (CHUNK, DATA_END) or not chunked) and self._is_proven(place):
+            if frame and frame[0] in opcodes and self._is_proven(place):
                 return place
         return None
 

@@ -24,7 +24,7 @@ from paul_ros.wording import quantity
 
 MAGIC = b"SQLite format 3\0"
 
-_ERRORS = (sqlite3.Error, UnicodeError)  # SQLite's own error text can hold damaged bytes
+_ERRORS = (sqlite3.Error, UnicodeError, MemoryError)  # damaged sizes, and damaged bytes in the text of an error
 
 _HEADER_BYTES = 100
 _SMALL_STEPS = 1000  # rows that are tried one by one behind damage; then the steps double
