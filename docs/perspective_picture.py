@@ -98,7 +98,7 @@ def figures(truth: np.ndarray, known: bool) -> list[list[float]]:
         S = S - S.mean(2, keepdims=True)
     rows = []
     for shape in solutions(S, view.W, visible):
-        found = place(shape, view.turn, model.metres_per_unit)
+        found = place(shape, view, model.metres_per_unit)
         missed = np.linalg.norm(found - truth, axis=2).mean(), metrics.n_mpjpe(found, truth).mean()
         rows.append([*(1000 * value for value in missed), np.linalg.norm(pixels(found) - xy, axis=2)[visible].mean()])
     return rows

@@ -272,7 +272,7 @@ def test_commands_and_node_know_the_same_images():
 
 
 def test_another_image_is_refused(model_file):
-    with pytest.raises(ValueError, match="image is 'crooked'; it must be auto or rectified or raw"):
+    with pytest.raises(ValueError, match="`image` is 'crooked'; it must be auto or rectified or raw"):
         open_stream(str(model_file), image="crooked")
 
 

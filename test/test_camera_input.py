@@ -47,7 +47,7 @@ def test_a_volatile_camera_comes_late_and_its_image_is_stated(ros, start_lifter,
     bench.camera.publish(info(p=(580, 580, 320, 240), d=BARREL))
     bench.until(lambda: bench.units() == "m", "metres")
     assert bench.layout()["image"] == "rectified" and bench.diagnosed()["noted_image_assumed"] == "1"
-    assert set_parameters(bench, image="crooked")[0].startswith("image is 'crooked'; it must be auto or")
+    assert set_parameters(bench, image="crooked")[0].startswith("`image` is 'crooked'; it must be auto or")
     assert set_parameters(bench, image="raw") == [""]
     bench.until(lambda: bench.layout()["image"] == "raw", "the other image")
     assert bench.layout()["distortion"] == "plumb_bob, corrected"

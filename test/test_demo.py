@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,8 +82,9 @@ def test_what_compare_must_find(two_seconds, model_file, tmp_path, change, findi
     done = replay(two_seconds, open_stream(model_file), tmp_path / "out.mcap")
     records = change(list(read_records(tmp_path / "out.mcap", ["/lifter/poses"])))
     with BagWriter(tmp_path / "changed.mcap") as writer:
-        for record in records:
-            writer.write_record(record)
+        # Readers follow the log times, not the order in the file.
+        for record, time in zip(records, sorted(record.log_time for record in records)):
+            writer.write_record(replace(record, log_time=time))
     key, value = finding
     assert compare(done, tmp_path / "changed.mcap")[1][key] == value
 

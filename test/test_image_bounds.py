@@ -10,6 +10,7 @@ from test_camera_info import CLOUD, cloud, info
 
 from msg_adapters import Keypoints2D
 from paul_ros.ros.diagnostics import OK, WARN, Health
+from paul_ros.ros.recent_counts import LASTING
 from paul_ros.stream.image_bounds import CORNER_MESSAGES, ImageBounds
 from paul_ros.stream.ledger import Ledger
 from paul_ros.stream.stream import LiftStream, open_stream
@@ -94,10 +95,11 @@ def resized(factor: float) -> np.ndarray:
 
 @pytest.mark.parametrize("factor, level", [(1, OK), (1.5, WARN), (3, WARN), (0.5, OK)])
 def test_a_resized_image_is_a_warning(stream, factor, level):
-    health = Health(0.0)
-    health.received(0.5)
-    health.published(stream.keypoints(CLOUD, cloud(resized(factor))).frame, 0)
-    report = health.report(1.0, stream, input_type=CLOUD)
+    health = Health(0.0, stream)
+    for second in range(LASTING):
+        health.received(second + 0.5)
+        health.published(stream.keypoints(CLOUD, cloud(resized(factor))).frame, 0)
+        report = health.report(second + 1.0, stream, input_type=CLOUD)
     assert report.level == level
     assert ("CameraInfo states an image of 640x480" in report.message) == (level == WARN)
 

@@ -35,6 +35,7 @@ LIVE = {
     "output_layout": (4, "", "coco17"),
     "model": (4, "human", "human"),
 }
+_LOGGERS = ("lifter", "rcl")
 FIXED = ("autostart", "publish_tf", "input_type", "start_type_description_service")
 ODD_NAMES = ("", "smothing", "a/b", ".", "smoothing.x", "/lifter/smoothing", "x" * 5000, "é 猫\n", "%s{}", "a\tb")
 ODD_NUMBERS = (math.nan, math.inf, -math.inf, -1e-9, -0.5, 1e308, 5e-324)
@@ -84,7 +85,7 @@ class _Node:
             def report_fault(self, where: str, error: Exception) -> None:
                 faults.append(f"{where}: {error!r}")
 
-        for logger in ("lifter", "rcl"):
+        for logger in _LOGGERS:
             set_logger_level(logger, LoggingSeverity.FATAL)
         self._node, self._faults, self._state, self._frames = Watched(), faults, "unconfigured", 0
         for number in (1, 3):
@@ -92,10 +93,14 @@ class _Node:
 
     def close(self) -> None:
         """Finalize and destroy the node."""
+        from rclpy.logging import LoggingSeverity, set_logger_level
+
         self._node.end()
         self._node.destroy_node()
         del self._node
         gc.collect()  # callbacks of a node refer to it
+        for logger in _LOGGERS:
+            set_logger_level(logger, LoggingSeverity.UNSET)
 
     def case(self) -> bool:
         """Send one request, then a frame; return whether the request was accepted.
@@ -132,7 +137,7 @@ class _Node:
         self._frames += 1
         message = cloud(make, header(make, self._rng, self._frames), [random_pose(self._rng)], self._rng)
         before = self._node.stream.counts["frames"]
-        self._node.pipeline.on_keypoints(foreign.CLOUD, make.serialise(message), "/keypoints", 0)
+        self._node.pipeline.on_keypoints(foreign.CLOUD, make.serialise(message), "/keypoints", 0, 0)
         if self._node.stream.counts["frames"] != before + 1:
             raise WrongOutput(f"the node does not lift: {dict(self._node.stream.ledger.drops)}")
 

@@ -134,7 +134,7 @@ def as_text(summary: dict) -> str:
     The damage of a bag is left out, as the command ends with it as its error.
     """
     shown = {key: value for key, value in summary.items() if key != "damage"}
-    if summary["kind"] == "bag":
+    if summary.get("kind") == "bag":
         shown["files"] = {file["file"]: _file_text(file) for file in summary["files"]}
     return "\n".join(_lines(shown, ""))
 
