@@ -14,8 +14,8 @@ from msg_adapters import ai, hri, opendr, openpose, point_cloud2, pose_array, yo
 from msg_adapters.camera_info import image_size, read_camera_info
 from msg_adapters.depth_image import DepthImage, read_depth
 from msg_adapters.factory import MessageFactory
+from msg_adapters.intrinsics import Intrinsics, in_pinhole
 from msg_adapters.keypoints import (
-    Intrinsics,
     Keypoints2D,
     MessageError,
     Note,
@@ -23,7 +23,6 @@ from msg_adapters.keypoints import (
     UnknownLayout,
     WrongPointCount,
     by_name,
-    in_pinhole,
     is_placeholder,
     join,
     record,

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from msg_adapters.distortion import EQUIDISTANT, Distortion, read_distortion
-from msg_adapters.keypoints import Intrinsics, MessageError, Note
+from msg_adapters.intrinsics import Intrinsics
+from msg_adapters.keypoints import MessageError, Note
 
 #: Limits of a focal length in multiples of the image's larger side.
 _FOCAL_PER_SIDE = (0.1, 100.0)

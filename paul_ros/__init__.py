@@ -16,7 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from msg_adapters.keypoints import Intrinsics
+    from msg_adapters.intrinsics import Intrinsics
     from paul_ros.errors import PaulError
     from paul_ros.layout import Layout, load_layout
     from paul_ros.lifted import Lifted
@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Intrinsics": "msg_adapters.keypoints",
+    "Intrinsics": "msg_adapters.intrinsics",
     "Layout": "paul_ros.layout",
     "Lifted": "paul_ros.lifted",
     "Lifter": "paul_ros.lifter",

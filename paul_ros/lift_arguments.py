@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msg_adapters.camera_info import read_camera_info
-from msg_adapters.keypoints import Intrinsics, MessageError
+from msg_adapters.intrinsics import Intrinsics
+from msg_adapters.keypoints import MessageError
 from paul_ros.errors import InputError
 from paul_ros.layout import Layout, layout_names, load_layout
 

@@ -8,7 +8,7 @@ import os
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msg_adapters.keypoints import Intrinsics
+from msg_adapters.intrinsics import Intrinsics
 from paul_ros.errors import InputError, ModelError
 from paul_ros.layout import Layout, midpoints
 from paul_ros.lift_arguments import Camera, as_intrinsics, as_layout, as_points, check_height

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_adapters.keypoints import Intrinsics
+from msg_adapters.intrinsics import Intrinsics
 
 _HALF_FIELD = 0.5  # cosine of 60 degrees: a point farther from the person's direction is a misdetection
 _EYE = np.eye(3)

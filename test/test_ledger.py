@@ -72,7 +72,7 @@ OF_PERSONS = {f"person_{reason}" for reason in (TOO_FEW_POINTS, DEGENERATE_POINT
 def test_the_table_has_every_reason_that_is_used_and_no_other():
     used = {reason: path for reason, path, _ in used_reasons()}
     missing = {reason: str(path) for reason, path in used.items() if reason not in REASONS}
-    assert not missing, f"add rows to paul_ros/stream/reasons.py: {missing}"
+    assert not missing, f"add rows to paul_ros/stream/drop_reasons.py or note_reasons.py: {missing}"
     unused = REASONS.keys() - used.keys() - OF_PERSONS
     assert not unused and OF_PERSONS <= REASONS.keys()
 

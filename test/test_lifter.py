@@ -8,7 +8,7 @@ import pytest
 from conftest import PERSON, coco_model, persons_at
 from scipy.spatial.transform import Rotation
 
-from msg_adapters.keypoints import Intrinsics
+from msg_adapters.intrinsics import Intrinsics
 from paul_ros import shape_fit
 from paul_ros.errors import InputError, ModelError
 from paul_ros.layout import load_layout

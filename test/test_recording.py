@@ -23,10 +23,11 @@ from msg_adapters.definitions import definitions
 from paul_ros.errors import BagError, WrongTopicError
 from paul_ros.offline.bag_reader import Recording, read_messages, read_records, topics_of
 from paul_ros.offline.bag_records import BagMessages, Record
+from paul_ros.offline.bag_topics import Topics
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.inspection import inspect
 from paul_ros.offline.mcap_frames import Frames
-from paul_ros.offline.replay import Topics, replay
+from paul_ros.offline.replay import replay
 from paul_ros.stream.stream import open_stream
 
 WORDS = "std_msgs/msg/String"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from people_data import captured_joints
 
-from msg_adapters.keypoints import Intrinsics
+from msg_adapters.intrinsics import Intrinsics
 from paul_ros.layout import load_layout
 from paul_ros.placement import centred_view
 from training.people.cameras import hidden_by_body, random_cameras

@@ -41,10 +41,13 @@ def listed_files(folder: Path) -> tuple[list[Path], list[Path]]:
     Both are empty without metadata.yaml, or if it is damaged, as a killed recorder leaves it.
     """
     try:
-        names = yaml.safe_load((folder / METADATA).read_text())["rosbag2_bagfile_information"]["relative_file_paths"]
-        wanted = list(dict.fromkeys(folder / Path(name).name for name in names))
+        metadata = yaml.safe_load((folder / METADATA).read_text(encoding="utf-8"))
+        names = metadata["rosbag2_bagfile_information"]["relative_file_paths"]
+        named = list(dict.fromkeys(folder / Path(name).name for name in names))
     except (OSError, yaml.YAMLError, ValueError, RecursionError, KeyError, TypeError):
         return [], []
+    # The last name of a metadata.yaml that was cut off may be cut too.
+    wanted = [file for file in named if file.name.endswith(SUFFIXES) or file.exists()]
     found = {file: _packed_or_unpacked(file) for file in wanted}
     return [file for file in found.values() if file], [file for file, there in found.items() if not there]
 

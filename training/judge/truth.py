@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_adapters.keypoints import Intrinsics
+from msg_adapters.intrinsics import Intrinsics
 from paul_ros.errors import NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout

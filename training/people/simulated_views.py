@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_adapters.keypoints import Intrinsics
+from msg_adapters.intrinsics import Intrinsics
 from paul_ros.placement import centred_view
 from training.people.cameras import Cameras, hidden_by_body, random_cameras
 from training.people.detector import Detections, detect, redefined, reported
