@@ -347,8 +347,6 @@ def rosbag2(folder, storage, mode=None, count=50, types=True):
 @pytest.mark.parametrize("storage", StoragePlugin)
 @pytest.mark.parametrize("mode", [None, CompressionMode.FILE, CompressionMode.MESSAGE])
 def test_every_storage_and_compression_of_rosbag2(tmp_path, storage, mode):
-    if storage is StoragePlugin.MCAP and mode is None:
-        pytest.skip("every other test")
     folder = rosbag2(tmp_path / "rec", storage, mode)
     assert numbers(folder) == (list(range(50)), None)
     assert topics_of(folder) == {"/words": (WORDS, 50)}
