@@ -113,6 +113,16 @@ def test_latched_publishers_have_their_own_subscription_as_long_as_they_live(ros
     node.destroy_node()
 
 
+def test_every_message_is_taken_if_the_middleware_has_no_stamps(ros):
+    node, taken = ros.create_node("cameras"), []
+    camera = CameraInput(node, "a_camera", taken.append, lambda *_: None)
+    for stamp in (0, 0, 7, 7, 0):
+        camera._taker()(stamp, {"source_timestamp": stamp})
+    assert taken == [0, 0, 7, 0]
+    camera.close()
+    node.destroy_node()
+
+
 def test_a_volatile_camera_is_not_asked_for_latched_messages(ros):
     from rclpy.event_handler import PublisherEventCallbacks
 

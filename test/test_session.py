@@ -73,6 +73,19 @@ def test_the_camera_frame_stays(stream, swap):
     assert other.ledger.notes == {"another_frame": 1}
 
 
+def test_the_frame_of_the_last_image_stays(stream, swap):
+    """Two cameras on one topic are noted without a CameraInfo too; an image without a frame is of neither."""
+    stream.keypoints(CLOUD, cloud(frame="left"))
+    other = swap(stream)
+    for frame in ("left", "", "left"):
+        other.keypoints(CLOUD, cloud(frame=frame))
+    assert other.ledger.notes == {"no_frame": 1}
+    for frame in ("right", "left"):
+        other.keypoints(CLOUD, cloud(frame=frame))
+    assert other.ledger.notes["frame_changed"] == 2
+    assert other.ledger.advice["frame_changed"].startswith("The keypoints' frame_id changed from 'right' to 'left'. ")
+
+
 def test_the_depth_images_stay(stream, swap):
     stream.camera_info(camera_info(MAKE))
     stream.depth(depth_image(MAKE, np.full((480, 640), 3.0)))
@@ -132,5 +145,5 @@ def test_all_that_a_session_remembers_is_tested_here():
     """A new attribute needs a test that a swap keeps it."""
     assert set(vars(Session())) == {
         "intrinsics", "image_size", "image", "camera_frame", "depths", "ledger", "counts", "lift_us", "person_ids",
-        "_last_stamp", "_camera_info", "_bounds",
+        "_last_stamp", "_last_frame", "_camera_info", "_bounds",
     }  # fmt: skip

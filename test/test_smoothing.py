@@ -109,6 +109,13 @@ def test_it_starts_anew(stamp, units):
     np.testing.assert_array_equal(filtered(("1",), stamp, lifted(raw[6], units), HIPS).points, raw[6])
 
 
+def test_a_person_of_another_camera_with_the_same_id_is_not_mixed_in():
+    filtered, raw = OneEuro(1.0), noisy(7)
+    run(filtered, raw[:6])
+    other = filtered(("1",), 6 * FRAME, lifted(raw[6]), HIPS, "another camera")
+    np.testing.assert_array_equal(other.points, raw[6])
+
+
 def test_it_goes_on_after_half_a_second():
     filtered, raw = OneEuro(1.0), noisy(7)
     run(filtered, raw[:6])

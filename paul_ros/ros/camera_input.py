@@ -69,9 +69,10 @@ class CameraInput:
         """Return the callback of a subscription."""
 
         def take(msg: CameraInfo, info: dict[str, Any]) -> None:
-            # A latched publisher's later messages reach both subscriptions, with the publisher's own stamp.
+            # A latched publisher's later messages reach both subscriptions, with the publisher's own stamp. Middleware
+            # that has no such stamps says 0.
             stamp = info["source_timestamp"]
-            if stamp not in self._stamps:
+            if not stamp or stamp not in self._stamps:
                 self._stamps.append(stamp)
                 self._on_camera_info(msg)
 

@@ -21,7 +21,7 @@ class Trouble:
     def __init__(self, node: Node) -> None:
         """Begin to watch."""
         self._node = node
-        self._began = time.monotonic()
+        self._last_clock = time.monotonic()
         self._qos_warnings: dict[str, str] = {}
 
     def add_qos_mismatch(self, topic: str, warning: str) -> None:
@@ -52,14 +52,13 @@ class Trouble:
         return (endpoint.node_name, endpoint.node_namespace) == own
 
     def _missing_clock(self) -> Iterable[str]:
-        clock = cast(ROSClock, self._node.get_clock())
-        waited = time.monotonic() - self._began >= SILENT_SECONDS
-        if not waited or not clock.ros_time_is_active or clock.now().nanoseconds:
-            return
+        clock, now = cast(ROSClock, self._node.get_clock()), time.monotonic()
         topic = self._node.resolve_topic_name("/clock")
-        # A simulation that stands still at its start publishes time zero.
-        if not self._node.count_publishers(topic):
+        # A simulation that stands still has a publisher all the same.
+        if not clock.ros_time_is_active or self._node.count_publishers(topic):
+            self._last_clock = now
+        elif now - self._last_clock >= SILENT_SECONDS:
             yield (
-                f"use_sim_time is true, but nobody publishes {topic}, so time stands still at zero. Start the "
-                "simulator, play the bag with --clock, or set `use_sim_time` to false."
+                f"use_sim_time is true, but nobody publishes {topic}, so time stands still. Start the simulator, play "
+                "the bag with --clock, or set `use_sim_time` to false."
             )

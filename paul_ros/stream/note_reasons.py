@@ -67,6 +67,13 @@ NOTE_REASONS = (
         warn_above=AT_ONCE,
     ),
     Reason(
+        "frame_changed",
+        NOTE,
+        "Without a CameraInfo, the frame_id of the keypoints changes, as if two cameras share a topic",
+        "Start a lifter for each camera, with its own `keypoints` and `camera_info`.",
+        warn_above=SOME,
+    ),
+    Reason(
         "confidence_range",
         NOTE,
         "Confidences lie outside 0..1 and are clipped, so `min_confidence` hides other points than it says",

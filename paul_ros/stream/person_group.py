@@ -67,11 +67,11 @@ class PersonGroup:
 def _subject(message: Arrival) -> Hashable:
     """Return a value that two messages of one image share only if they are about one person.
 
-    Each body of ROS4HRI has a topic of its own, with its id in the name. Elsewhere only a message with equal pixels is
-    a repetition: trackers exist that give all persons one id.
+    Each body of ROS4HRI has a topic of its own, /humans/bodies/ID/skeleton2d. Elsewhere only a message with equal
+    pixels is a repetition: trackers exist that give all persons one id, on topics such as /camera/0/poses.
     """
     ids = message.keypoints.ids
-    if any(name in message.topic.split("/") for name in ids if name):
+    if any(f"/bodies/{name}/" in message.topic for name in ids if name):
         return message.topic
     # Persons of whom nothing is seen look alike.
     return (ids, message.keypoints.xy.tobytes()) if message.keypoints.visible.any() else id(message)

@@ -46,6 +46,7 @@ class Session:
         self.counts: Counter[str] = Counter(frames=0, persons=0, lifted=0)
         self.lift_us: deque[float] = deque(maxlen=_LIFT_TIMES_KEPT)
         self._last_stamp: int | None = None
+        self._last_frame = ""
         self._camera_info: Any = None
         self._bounds = ImageBounds()
 
@@ -91,14 +92,22 @@ class Session:
         return corrected
 
     def check_header(self, stamp: int, frame_id: str) -> None:
-        """Note a stamp (nanoseconds) that runs backwards, and a frame that is not the camera's."""
+        """Note a stamp (nanoseconds) that runs backwards, and a frame that is not the camera's or changes."""
         if self._last_stamp is not None and stamp < self._last_stamp:
             self.ledger.note("stamp_backwards")
         self._last_stamp = stamp
         # The image and the CameraInfo of one camera have one frame, its optical frame (REP-104).
-        if self.camera_frame and frame_id != self.camera_frame:
+        if self.camera_frame:
+            if frame_id != self.camera_frame:
+                self.ledger.note(
+                    "another_frame",
+                    f"The keypoints' frame_id is {frame_id!r}, CameraInfo's {self.camera_frame!r}. "
+                    f"{REASONS['another_frame'].fix}",
+                )
+        elif self._last_frame and frame_id and frame_id != self._last_frame:
             self.ledger.note(
-                "another_frame",
-                f"The keypoints' frame_id is {frame_id!r}, CameraInfo's {self.camera_frame!r}. "
-                f"{REASONS['another_frame'].fix}",
+                "frame_changed",
+                f"The keypoints' frame_id changed from {self._last_frame!r} to {frame_id!r}. "
+                f"{REASONS['frame_changed'].fix}",
             )
+        self._last_frame = frame_id or self._last_frame

@@ -46,17 +46,20 @@ class OneEuro:
     def __init__(self, cutoff: float = 0.0) -> None:
         self.cutoff = cutoff
         self._tracks: dict[str, _Track] = {}
-        self._stamp, self._units, self._swept = 0, "", 0
+        self._stamp, self._scene, self._swept = 0, ("", ""), 0
 
-    def __call__(self, ids: tuple[str, ...], stamp: int, lifted: Lifted, root: tuple[int, ...]) -> Lifted:
+    def __call__(
+        self, ids: tuple[str, ...], stamp: int, lifted: Lifted, root: tuple[int, ...], frame_id: str = ""
+    ) -> Lifted:
         """Filter the points of persons with an id; their roots become the mean of the points `root`.
 
         All tracks start anew if time runs backwards, as when a bag loops, if the stamp is missing (0), or if the units
-        changed.
+        or the frame changed.
         """
-        if stamp < self._stamp or not stamp or lifted.units != self._units or not self.cutoff:
+        scene = lifted.units, frame_id
+        if stamp < self._stamp or not stamp or scene != self._scene or not self.cutoff:
             self._tracks.clear()
-        self._stamp, self._units = stamp, lifted.units
+        self._stamp, self._scene = stamp, scene
         self._sweep()
         if not self.cutoff:
             return lifted

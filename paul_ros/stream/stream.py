@@ -312,7 +312,7 @@ class LiftStream:
         # The root of a person lies below the skin. For other objects, assume that it lies on the visible surface.
         surface = SURFACE if model.stature else 0.0
         lifted = self.session.depths.place(lifted, given.stamp, self.intrinsics, surface, self.ledger)
-        lifted = self._filter(given.ids, given.stamp, lifted, model.layout.root)
+        lifted = self._filter(given.ids, given.stamp, lifted, model.layout.root, given.frame_id)
         visible = np.where(lifted.ok[:, None], lifted.used, given.visible)
         used = replace(given, visible=visible, confidence=np.where(visible, given.confidence, 0.0))
         metres_per_unit = self.lifter.metres_per_unit if lifted.units == "m" else None
