@@ -94,5 +94,7 @@ def _reach(xy: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]] | 
     flat = xy.reshape(-1, 2)
     if not len(flat):
         return None
-    low, high = np.fmin.reduce(flat).tolist(), np.fmax.reduce(flat).tolist()
+    # One row for all x and one for all y: numpy reduces long rows ten times as fast as short ones.
+    rows = np.ascontiguousarray(flat.T)
+    low, high = np.fmin.reduce(rows, axis=1).tolist(), np.fmax.reduce(rows, axis=1).tolist()
     return None if math.isnan(low[0]) else (tuple(low), tuple(high))
