@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import LIFTER, ROOT, LifterProcess, camera_info, header_of, persons_at, seen
 from foreign_messages import DEFINITIONS as FOREIGN
-from node_bench import GOOD, MAKE, PATIENCE, Bench, cloud, good, header_in, nobody, set_parameters
+from node_bench import GOOD, MAKE, PATIENCE, Bench, class_of, cloud, good, header_in, nobody, set_parameters
 
 import msg_adapters
 from msg_adapters import outputs
@@ -355,6 +355,25 @@ def test_a_detector_of_another_type_is_found_when_the_first_has_gone(ros, start_
         bench.until(lambda kind=kind: f"Reading {kind}" in lifter.log(), f"a subscription of {kind}")
         bench.until(bench.keypoints.get_subscription_count, "the subscription")
         bench.close()
+
+
+def test_a_detector_of_another_type_beside_the_first_is_named(ros, start_lifter, model_file):
+    """Its messages are not read: a WARN until one of the two is gone."""
+    bench = Bench(ros, start_lifter("-p", f"model:={model_file}"))
+    bench.matched()
+    context = ros.Context()  # one process cannot have two types on a topic
+    ros.init(context=context)
+    other = ros.create_node("other", namespace=bench.lifter.namespace, context=context)
+    publisher = other.create_publisher(class_of("geometry_msgs/msg/PoseArray"), "keypoints", 10)
+    text = f"/{bench.lifter.namespace}/keypoints also has the type geometry_msgs/msg/PoseArray: nothing comes from"
+    bench.until(lambda: text in bench.next_diagnostics().message, "the warning")
+    assert bench.next_diagnostics().level == b"\x01" and bench.lifter.log().count(text) == 1
+    bench.lifts()
+    other.destroy_publisher(publisher)
+    bench.until(lambda: text not in bench.next_diagnostics().message, "the end of the warning")
+    other.destroy_node()
+    ros.shutdown(context=context)
+    bench.close()
 
 
 def test_a_message_package_that_is_not_installed_is_named(ros, start_lifter, model_file):

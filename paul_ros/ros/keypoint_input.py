@@ -64,6 +64,7 @@ class KeypointInput:
         topic: full name of the topic.
         type_name: type of the topic; None until it is subscribed.
         problem: why the topic cannot be read; '' if it can, or if nobody publishes it yet.
+        trouble: a sentence about publishers that are not read beside those that are; none if there are none.
     """
 
     def __init__(self, node: Node, topic: str, wanted: str, listener: KeypointListener, warn: ThrottledLog) -> None:
@@ -84,6 +85,7 @@ class KeypointInput:
         self.topic = node.resolve_topic_name(topic)
         self.type_name: str | None = None
         self.problem = ""
+        self.trouble: list[str] = []
         self._node, self._wanted, self._listener, self._warn = node, wanted, listener, warn
         self._subscription: Subscription | None = None
         self._bodies = BodyTopics(self.topic, self._subscribe_body, node.destroy_subscription)
@@ -112,11 +114,17 @@ class KeypointInput:
             False if the type was found from publishers that are gone: the subscription is closed, and
             `try_subscribe` may find another. A type that was asked for stays, with a warning.
         """
+        self.trouble = []
         if self.type_name is None:
             return True
         types = self._published_types()
         if not types or self.type_name in types:
             self.problem = ""
+            if others := [name for name in types if name != self.type_name]:
+                self.trouble = [
+                    f"{self.topic} also has the type {', '.join(others)}: nothing comes from it. Let only "
+                    "one detector publish this topic."
+                ]
             return True
         if self._wanted == AUTO:
             self.close()

@@ -225,7 +225,7 @@ class Pipeline:
             self._search_timer.reset()
         self._search_latched_camera()
         input_type = self._input.type_name or "none"
-        trouble = self._trouble.sentences()
+        trouble = [*self._trouble.sentences(), *self._input.trouble]
         report = self._health.report(time.monotonic(), self.stream, self._input.problem, input_type, trouble)
         self._advisor.report_reasons(report.warnings, self.stream.ledger)
         self._advisor.report_trouble(trouble)
