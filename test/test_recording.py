@@ -276,6 +276,22 @@ def test_impossible_log_times(tmp_path, time):
     assert found == [0, 2] and "no possible log time" in str(error)
 
 
+def test_topics_without_messages_do_not_spoil_the_checksum(tmp_path):
+    """mcap's writer leaves them out of it; the file is whole."""
+    with open(tmp_path / "a.mcap", "wb") as file:
+        writer = McapWriter(file, use_chunking=False, enable_data_crcs=True)
+        writer.start("ros2", "a recorder")
+        schema = writer.register_schema(WORDS, "ros2msg", word(1).definition.encode())
+        writer.add_message(writer.register_channel("/words", "cdr", schema), 1, word(1).data, 1)
+        writer.register_channel("/empty", "cdr", schema)
+        writer.finish()
+    assert numbers(tmp_path / "a.mcap") == ([1], None)
+    content = bytearray((tmp_path / "a.mcap").read_bytes())
+    content[content.index(b"x" * 99)] = 0x79
+    (tmp_path / "a.mcap").write_bytes(content)
+    assert "the checksum of the data section is wrong" in str(numbers(tmp_path / "a.mcap")[1])
+
+
 def test_messages_outside_chunks_are_read_on_too(tmp_path):
     path = write(tmp_path / "a.mcap", [word(n, padding=2000) for n in range(60)], 0)
     whole = bytearray(path.read_bytes())
@@ -309,6 +325,43 @@ def test_numbers_alone_make_no_splits(tmp_path, second, refused):
     found, error = numbers(tmp_path)
     assert (error is not None) == refused
     assert len(found) == (0 if refused else 40)
+
+
+def test_numbered_files_that_do_not_follow_each_other_say_where_and_what_to_do(tmp_path):
+    splits(tmp_path, 2)
+    write(tmp_path / "rec_2.mcap", [word(n, second=500) for n in range(20)])
+    with pytest.raises(
+        BagError, match="rec_2.mcap begins 496 s after the end of rec_1.mcap.*`ros2 bag reindex -s mcap"
+    ):
+        Recording(tmp_path)
+    listing(tmp_path, "rec_0.mcap", "rec_1.mcap", "rec_2.mcap")
+    assert len(numbers(tmp_path)[0]) == 60
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_copied_file_is_refused_by_name(tmp_path, listed):
+    files = splits(tmp_path, 3)
+    shutil.copy(files[1], tmp_path / "rec_3.mcap")
+    if listed:
+        listing(tmp_path, *(f"rec_{k}.mcap" for k in range(4)))
+    with pytest.raises(BagError, match="rec_3.mcap is a copy of rec_1.mcap: move one"):
+        Recording(tmp_path)
+
+
+def test_folders_named_as_files(tmp_path):
+    (tmp_path / "take.mcap").mkdir()
+    splits(tmp_path / "take.mcap", 2, name="take.mcap_{}.mcap")
+    assert numbers(tmp_path / "take.mcap") == (list(range(40)), None)
+    with pytest.raises(
+        BagError, match=f"lies in a folder of its own: give that, as in `paul replay {tmp_path}/take.mc"
+    ):
+        Recording(tmp_path)
+
+
+def test_nothing_but_the_list_is_left(tmp_path):
+    listing(tmp_path, "rec_0.mcap")
+    with pytest.raises(BagError, match=r"metadata.yaml lists are missing \(rec_0.mcap\): copy them"):
+        Recording(tmp_path)
 
 
 def test_a_folder_of_recordings_is_refused(tmp_path):

@@ -31,7 +31,12 @@ def is_bag(path: Path) -> bool:
 
 def bag_files(folder: Path) -> list[Path]:
     """Return the recordings' files of a folder, sorted by name. Files that are still written come only alone."""
-    files = sorted(file for file in folder.iterdir() if file.name.endswith(SUFFIXES) and not file.name.startswith("."))
+    files = sorted(
+        file
+        for file in folder.iterdir()
+        # `ros2 bag record -o NAME.mcap` makes a folder of that name.
+        if file.name.endswith(SUFFIXES) and not file.name.startswith(".") and not file.is_dir()
+    )
     return files or sorted(folder.glob("*.part"))
 
 

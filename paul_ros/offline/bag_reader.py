@@ -7,6 +7,7 @@ where nothing behind it can be read. After all whole messages comes one BagError
 
 from __future__ import annotations
 
+import filecmp
 import functools
 import itertools
 from collections.abc import Iterable, Iterator
@@ -61,12 +62,19 @@ class Recording:
         # Files that metadata.yaml lacks belong to the recording if they follow it in name and in time.
         splits = Splits.of([*listed, *(file for file in files if file not in listed)])
         opened = {number: BagFile(file) for number, file in splits.files.items()} if splits else {}
-        if opened and _is_one_recording(opened):
+        gap = _gap(opened)
+        if opened and not gap:
             self.missing = self.missing or (splits.missing if splits and not listed else [])
-            return _in_order_of_time(list(opened.values()))
-        if listed or len(files) == 1:
-            return _in_order_of_time([BagFile(file) for file in listed or files])
-        raise BagError(_not_one(folder, files))
+            chosen = list(opened.values())
+        elif listed or len(files) == 1:
+            chosen = [BagFile(file) for file in listed or files]
+        else:
+            chosen = []
+        if copy := _copy_among(chosen or list(opened.values())):
+            raise BagError(f"{folder}: {copy}")
+        if not chosen:
+            raise BagError(_not_one(folder, files, self.missing, gap))
+        return _in_order_of_time(chosen)
 
     def records(self, topics: Iterable[str] | None = None) -> Iterator[Record]:
         """Yield the messages on some topics, as `read_records` does; raises the same BagError."""
@@ -160,18 +168,24 @@ def _in_order_of_time(files: list[BagFile]) -> list[BagFile]:
     return sorted(files, key=lambda file: (file.span is None, file.span or (0, 0)))
 
 
-def _is_one_recording(splits: dict[int, BagFile]) -> bool:
-    """Return whether numbered files follow each other in time, as the splits of one recording do.
+def _gap(splits: dict[int, BagFile]) -> str:
+    """Return why numbered files do not follow each other in time, as the splits of one recording do; '' if they do.
 
     Recordings of one name and different numbers overlap by more than half, as those of two robots, or are far apart.
     """
-    timed = [(number, *file.span) for number, file in splits.items() if file.span]
-    longest = max((last - first for _, first, last in timed), default=0)
-    for (number, first, last), (next_number, next_first, _) in zip(timed, timed[1:]):
+    timed = [(number, file, *file.span) for number, file in splits.items() if file.span]
+    longest = max((last - first for *_, first, last in timed), default=0)
+    for (number, file, first, last), (next_number, following, next_first, _) in itertools.pairwise(timed):
         missing = next_number - number - 1
-        if next_first < first or next_first - last > _LONGEST_PAUSE * (1 + missing) + longest * missing:
-            return False
-    return not any(_overlap(one, other) for (_, *one), (_, *other) in itertools.combinations(timed, 2))
+        if next_first < first:
+            return f"{following.path.name} begins before {file.path.name}"
+        if next_first - last > _LONGEST_PAUSE * (1 + missing) + longest * missing:
+            seconds = (next_first - last) / 1e9
+            return f"{following.path.name} begins {seconds:.0f} s after the end of {file.path.name}"
+    for (_, file, *span), (_, other, *other_span) in itertools.combinations(timed, 2):
+        if _overlap(span, other_span):
+            return f"{file.path.name} and {other.path.name} overlap in time"
+    return ""
 
 
 def _overlap(one: list[int], other: list[int]) -> bool:
@@ -180,20 +194,49 @@ def _overlap(one: list[int], other: list[int]) -> bool:
     return common > 0 and common > _LARGEST_OVERLAP * min(one[1] - one[0], other[1] - other[0])
 
 
-def _not_one(folder: Path, files: list[Path]) -> str:
-    """Return the error for a folder that holds no recording of its own, or several."""
+def _copy_among(files: list[BagFile]) -> str:
+    """Return which file is a copy of another, and what to do; '' = none. All its messages would come twice."""
+    kept: dict[tuple[object, int], BagFile] = {}
+    for file in files:
+        if not file.span:
+            continue
+        first = kept.setdefault((file.span, file.path.stat().st_size), file)
+        if first is not file and filecmp.cmp(first.path, file.path, shallow=False):
+            return f"{file.path.name} is a copy of {first.path.name}: move one of them to another folder"
+    return ""
+
+
+def _not_one(folder: Path, files: list[Path], missing: list[Path], gap: str) -> str:
+    """Return the error for a folder that holds no recording of its own, or several.
+
+    Args:
+        folder: that was given.
+        files: recordings in it.
+        missing: files that metadata.yaml lists.
+        gap: why numbered files are no splits of one recording; '' = the files are not numbered.
+    """
     if not files:
         files = sorted(child for child in folder.iterdir() if child.is_dir() and _holds_bag(child))
+    if not files and missing:
+        named = ", ".join(file.name for file in missing[:_NAMED_FILES])
+        return f"{folder}: the files that {METADATA} lists are missing ({named}): copy them into this folder"
     if not files:
         ros1 = sorted(folder.glob("*.bag"))
         if ros1:
             return f"{folder}: {BagFile(ros1[0]).refusal}"
         return f"{folder}: no recording in this folder (no {', no '.join(SUFFIXES)} file)"
-    named = " or ".join(f"`paul replay {_quoted(file)}`" for file in files[:_NAMED_FILES])
+    commands = [f"`paul replay {_quoted(file)}`" for file in files[:_NAMED_FILES]]
+    if len(files) == 1:
+        return f"{folder}: the recording lies in a folder of its own: give that, as in {commands[0]}"
     more = f" and {len(files) - _NAMED_FILES} more" if len(files) > _NAMED_FILES else ""
+    one_by_one = f"ive them one by one, as in {' or '.join(commands)}{more}; `paul train` takes several at once"
+    if not gap:
+        return f"{folder}: holds {quantity(len(files), 'recording')}, not the files of one. G{one_by_one}"
+    storage = "sqlite3" if ".db3" in files[0].name else "mcap"
     return (
-        f"{folder}: holds {quantity(len(files), 'recording')}, not the files of one. Give them one by one, as in "
-        f"{named}{more}; `paul train` takes several at once"
+        f"{folder}: holds {len(files)} numbered files whose times do not follow each other: {gap}. If they are one "
+        f"recording, list them in {METADATA} with `ros2 bag reindex -s {storage} {_quoted(folder)}`. Otherwise "
+        f"g{one_by_one}"
     )
 
 

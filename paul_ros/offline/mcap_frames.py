@@ -88,7 +88,7 @@ class Frames:
 
     def _walk_data(self) -> int | None:
         """Find the blocks; return the place behind the data section, or None if the file ends before."""
-        at = len(MAGIC)
+        at = described = len(MAGIC)
         while True:
             frame = self._frame(at)
             if frame is None or frame[0] == FOOTER:
@@ -100,13 +100,15 @@ class Frames:
                 continue
             opcode, end = frame
             if opcode == DATA_END:
-                self._check_data(at, end)
+                self._check_data(at, end, described)
                 return end
             try:
                 self._take(opcode, at, end)
             except struct.error:
                 self.problems.append(f"the record at byte {at} is too short")
             at = end
+            if opcode not in (SCHEMA, CHANNEL):
+                described = end
 
     def _frame(self, at: int) -> tuple[int, int] | None:
         """Return the opcode and the end of the record at a place, or None if there is no whole record."""
@@ -189,12 +191,18 @@ class Frames:
         else:
             self.blocks.append(Block(time, time, at, end, False))
 
-    def _check_data(self, at: int, end: int) -> None:
-        """Check the checksum in the record that ends the data section: of all bytes before it; 0 = not computed."""
+    def _check_data(self, at: int, end: int, described: int) -> None:
+        """Check the checksum in the record that ends the data section: of all bytes before it; 0 = not computed.
+
+        The Python package `mcap` 1.6 leaves out the last descriptions of a file without chunks, those of topics without
+        messages. They begin at `described`.
+        """
         content = self._stream.read(end - at - FRAME.size)
         if len(content) < _DATA_END_CONTENT.size:
             self.problems.append("the end of the data section is damaged")
-        elif (checksum := _DATA_END_CONTENT.unpack_from(content)[0]) and checksum != self._checksum(0, at):
+        elif (checksum := _DATA_END_CONTENT.unpack_from(content)[0]) and checksum not in (
+            self._checksum(0, place) for place in {at, described}
+        ):
             self.problems.append("the checksum of the data section is wrong")
 
     def _checksum(self, start: int, end: int) -> int:
