@@ -103,6 +103,16 @@ def test_a_record_is_copied_as_it_is(bag, tmp_path):
     assert (tmp_path / "copy.mcap").read_bytes() == bag.read_bytes()
 
 
+def test_two_types_on_one_topic_keep_their_own(tmp_path):
+    make = BagMessages()
+    messages = [make("std_msgs/msg/String", data="a"), make("std_msgs/msg/Bool", data=True)]
+    with BagWriter(tmp_path / "a.mcap") as writer:
+        for time, message in enumerate(messages):
+            writer.write("/a", message, time)
+    read = [(name, message.data) for _, name, message, _ in read_messages(tmp_path / "a.mcap")]
+    assert read == [("std_msgs/msg/String", "a"), ("std_msgs/msg/Bool", True)]
+
+
 def test_cut_anywhere_gives_what_was_whole(bag, tmp_path):
     """Never other messages, never another kind of error; half a file gives about half of them."""
     whole = bag.read_bytes()

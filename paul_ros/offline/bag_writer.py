@@ -54,7 +54,7 @@ class BagWriter:
         self._compression = compression
         self._messages = messages or BagMessages()
         self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
 
     def __enter__(self) -> BagWriter:
         """Open the file. Raises OutputError if it cannot be written."""
@@ -91,12 +91,12 @@ class BagWriter:
 
     def write_cdr(self, topic: str, type_name: str, data: bytes, log_time: int, qos: str = "") -> None:
         """Append a serialised message of a type that this writer's factory knows; else as `write`."""
-        definition = "" if topic in self._channels else self._messages.definition(type_name)
+        definition = "" if (topic, type_name) in self._channels else self._messages.definition(type_name)
         self.write_record(Record(topic, type_name, data, log_time, definition, qos=qos))
 
     def write_record(self, record: Record) -> None:
         """Append a record of another bag unchanged, with its definition; raises OutputError."""
-        channel = self._channels.get(record.topic) or self._add_channel(record)
+        channel = self._channels.get((record.topic, record.type_name)) or self._add_channel(record)
         with self._disk_errors():
             # rosbag2 and rosbags too set publish_time = log_time where the middleware gave none.
             self._writer.add_message(channel, record.log_time, record.data, record.log_time)
@@ -108,10 +108,11 @@ class BagWriter:
             self._schemas[record.type_name] = self._writer.register_schema(
                 record.type_name, record.encoding, definition.encode()
             )
-        self._channels[record.topic] = self._writer.register_channel(
+        channel = self._writer.register_channel(
             record.topic, "cdr", self._schemas[record.type_name], {"offered_qos_profiles": record.qos}
         )
-        return self._channels[record.topic]
+        self._channels[record.topic, record.type_name] = channel
+        return channel
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
