@@ -34,7 +34,10 @@ def test_the_only_camera_is_found_whatever_its_name(tmp_path, model_file, capsys
     report = json.loads((tmp_path / "r.json").read_text())
     assert (report["camera_info_topic"], report["units"]) == ("/rig/left/my_info", "m")
     assert report["root_error_median_mm"] > 0
-    assert "keypoints /keypoints, camera /rig/left/my_info\n" in capsys.readouterr().out
+    assert (
+        "keypoints /keypoints, camera /rig/left/my_info (rectified image; its distortion: none)\n"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(

@@ -271,6 +271,45 @@ def test_a_bag_of_two_cameras_needs_a_choice(tmp_path):
     assert np.ptp(far.W) < 0.6 * np.ptp(near.W)
 
 
+BARREL = [-0.25, 0.05, 0.001, -0.001, 0.0]
+
+
+@pytest.fixture
+def barrel_bag(tmp_path):
+    """The shipped bag with a distorted lens, whose P differs from K by a factor."""
+    with BagWriter(tmp_path / "barrel.mcap") as out:
+        for topic, _, message, stamp in read_messages(BAG, {"/camera_info", "/keypoints"}):
+            if topic == "/camera_info":
+                p = message.p * np.where(np.arange(12) % 5, 1, 1.25)
+                message = replace(message, d=np.array(BARREL), distortion_model="plumb_bob", p=p)
+            out.write(topic, message, stamp)
+    return tmp_path / "barrel.mcap"
+
+
+def test_the_image_of_a_bags_keypoints_is_chosen(barrel_bag, tmp_path):
+    raw, rectified, likely = (load_training_data(barrel_bag, COCO, image=i) for i in ("raw", "rectified", "auto"))
+    assert np.ptp(raw.W) > 1.2 * np.ptp(rectified.W) and not raw.notes and not rectified.notes
+    np.testing.assert_array_equal(likely.W, rectified.W)
+    (note,) = likely.notes
+    assert note.startswith("CameraInfo has distortion") and "Set --image to raw" in note
+    plain = load_training_data(BAG, COCO)
+    assert not np.allclose(raw.W, plain.W, atol=0.01)  # the distortion is corrected
+    train(barrel_bag, "-o", tmp_path / "m.npz", "--image", "raw", *SMALL)
+    assert not load_model(tmp_path / "m.npz").header["training"]["notes"]
+
+
+def test_keypoints_without_a_ray_are_counted(tmp_path):
+    """The barrel folds the image back at 40 degrees: a point beyond is hidden, and a note says so."""
+    with BagWriter(tmp_path / "far.mcap") as out:
+        for topic, _, message, stamp in read_messages(BAG, {"/camera_info", "/keypoints"}):
+            if topic == "/camera_info":
+                k = message.k * np.where(np.arange(9) % 4, 1, 0.3)
+                message = replace(message, d=np.array([-0.4, 0, 0, 0, 0.0]), k=k)
+            out.write(topic, message, stamp)
+    data = load_training_data(tmp_path / "far.mcap", COCO, image="raw")
+    assert any("hidden: the distortion model has no ray there" in note for note in data.notes)
+
+
 @pytest.mark.parametrize("length", ["[left_hip, left_hoof, 0.4]", "[nose, nose, 1]", "[nose, left_eye, x]", "5"])
 def test_lengths_that_are_none_are_refused_before_training(data_file, tmp_path, length):
     why = "; the layout has no 'left_hoof'$" if "hoof" in length else "$"

@@ -55,6 +55,7 @@ def read_bag(
     min_confidence: float,
     guessed: bool,
     camera_info_topic: str | None = None,
+    image: str = "auto",
 ) -> RawFrames:
     """Read the keypoints of a bag; see ``load_training_data``.
 
@@ -64,6 +65,8 @@ def read_bag(
         topic: that is read, with * for any part of a name; None reads all.
         min_confidence: points of a lower one are hidden.
         guessed: nobody named the layout, so a plain list of points is one person until a message shows that.
+        camera_info_topic: of the camera of the keypoints; None: the only one.
+        image: of the keypoints, `auto`, `rectified` or `raw`.
 
     Raises:
         MissingPackageError: the packages that read bags are missing.
@@ -73,7 +76,7 @@ def read_bag(
     require("train", "mcap", "rosbags")
     from paul_ros.offline.bag_reader import Recording, matches
 
-    cameras = _bag_cameras(path, topic, camera_info_topic)
+    cameras = _bag_cameras(path, topic, camera_info_topic, image)
     rejections = dict(cameras.rejections)
     refused: dict[tuple[str, str], tuple[int, str]] = {}
     recording = Recording(path)
@@ -89,7 +92,10 @@ def read_bag(
     ((name, messages),) = frames.items()
     notes = _losses(recording, {what: last for what, last in refused.items() if matches(what[0], name)})
     if cameras.intrinsics:
+        seen = sum(int(message.visible.sum()) for _, message in messages)
         messages = [(time, msg_adapters.in_pinhole(message, cameras.at(time))) for time, message in messages]
+        without_ray = seen - sum(int(message.visible.sum()) for _, message in messages)
+        notes += _camera_notes(cameras, without_ray)
     xy = np.concatenate([message.xy for _, message in messages])
     visible = np.concatenate([message.visible & (message.confidence >= min_confidence) for _, message in messages])
     if not cameras.intrinsics:
@@ -98,6 +104,18 @@ def read_bag(
     owners = [cameras.at(time) for time, message in messages for _ in range(message.persons)]
     rays = _rays(xy[some], visible[some], [owners[row] for row in np.flatnonzero(some)])
     return RawFrames(rays, visible[some], layout, calibrated=True, notes=notes)
+
+
+def _camera_notes(cameras: _Cameras, without_ray: int) -> tuple[str, ...]:
+    """Return notes of what was assumed about the cameras, and of points that their distortion hides."""
+    assumed = dict.fromkeys(note.text for _, camera in cameras.intrinsics for note in camera.notes)
+    notes = [text.replace("`image`", "--image") for text in assumed]
+    if without_ray:
+        notes.append(
+            f"{quantity(without_ray, 'keypoint')} hidden: the distortion model has no ray there. If they are many, "
+            "calibrate the camera with images that reach to its borders"
+        )
+    return tuple(notes)
 
 
 def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrinsics]) -> np.ndarray:
@@ -179,7 +197,7 @@ def _bag_keypoints(
     return frames
 
 
-def _bag_cameras(path: Path, keypoints: str | None, given: str | None) -> _Cameras:
+def _bag_cameras(path: Path, keypoints: str | None, given: str | None, image: str) -> _Cameras:
     """Read the CameraInfo that replay would use.
 
     Cameras are read before the keypoints: some keypoints are shares of the image size, and the first of them may come
@@ -201,7 +219,7 @@ def _bag_cameras(path: Path, keypoints: str | None, given: str | None) -> _Camer
         try:
             # An uncalibrated camera has an image size too.
             sizes.add(msg_adapters.image_size(info))
-            camera = msg_adapters.read_camera_info(info)
+            camera = msg_adapters.read_camera_info(info, image)
         except msg_adapters.MessageError as error:
             rejections[record.topic] = str(error)
             continue

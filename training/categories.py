@@ -27,6 +27,7 @@ def load_files(
     topic: str | None = None,
     min_confidence: float = MIN_CONFIDENCE,
     camera_info_topic: str | None = None,
+    image: str = "auto",
 ) -> TrainingData:
     """Load one or several files, each as ``load_training_data`` does.
 
@@ -36,7 +37,7 @@ def load_files(
     Raises:
         DataError, BagError: see ``load_training_data``; or files that cannot be trained on together.
     """
-    parts = [load_training_data(path, layout, topic, min_confidence, camera_info_topic) for path in paths]
+    parts = [load_training_data(path, layout, topic, min_confidence, camera_info_topic, image) for path in paths]
     if len({part.calibrated for part in parts}) > 1:
         raise DataError(
             "some files hold rays and others pixels (`calibrated`, or a bag's CameraInfo): train them apart"

@@ -23,6 +23,7 @@ def load_training_data(
     topic: str | None = None,
     min_confidence: float = MIN_CONFIDENCE,
     camera_info_topic: str | None = None,
+    image: str = "auto",
 ) -> TrainingData:
     """Load 2D keypoints to train on.
 
@@ -36,6 +37,7 @@ def load_training_data(
             topic per person: /humans/bodies/*/skeleton2d.
         min_confidence: keypoints of a bag with a lower confidence count as hidden, as in the node.
         camera_info_topic: of the camera of the keypoints, if the bag has several.
+        image: of a bag's keypoints, ``auto``, ``rectified`` or ``raw``; see ``msg_adapters.read_camera_info``.
 
     Raises:
         DataError: nothing to train on, arrays that do not fit the layout, or values that are no image points.
@@ -47,5 +49,5 @@ def load_training_data(
     if path.suffix == ".npz":
         return checked(read_arrays(path, layout), path, guessed=layout is None)
     named = layout or load_layout(DEFAULT_LAYOUT)
-    raw = read_bag(path, named, topic, min_confidence, layout is None, camera_info_topic)
+    raw = read_bag(path, named, topic, min_confidence, layout is None, camera_info_topic, image)
     return checked(raw, path, guessed=False)

@@ -21,6 +21,7 @@ class TrainingOptions:
         layout: of the points, name or YAML file; None: guessed.
         topic: of a bag's keypoints; None: the only one.
         camera_info_topic: of a bag's camera; None: the only one.
+        image: of a bag's keypoints, ``auto``, ``rectified`` or ``raw``; see ``msg_adapters.read_camera_info``.
         min_confidence: keypoints of a bag below it count as hidden.
         recipe: name or YAML file.
         overrides: ``key=value`` settings of the recipe.
@@ -39,6 +40,7 @@ class TrainingOptions:
     layout: str | None = None
     topic: str | None = None
     camera_info_topic: str | None = None
+    image: str = "auto"
     min_confidence: float = 0.3
     recipe: str = "default"
     overrides: tuple[str, ...] = ()

@@ -33,7 +33,9 @@ def load_keypoints(options: TrainingOptions) -> TrainingData:
     for path in options.data:
         _check_folder(Path(path))
     layout = load_layout(options.layout) if options.layout else None
-    return load_files(options.data, layout, options.topic, options.min_confidence, options.camera_info_topic)
+    return load_files(
+        options.data, layout, options.topic, options.min_confidence, options.camera_info_topic, options.image
+    )
 
 
 def _check_folder(path: Path) -> None:

@@ -8,7 +8,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from paul_ros.cli.options import Commands, HelpFormatter, add_camera_info_topic, add_json, add_min_confidence
+from paul_ros.cli.options import Commands, HelpFormatter, add_camera_info_topic, add_image, add_json, add_min_confidence
 from paul_ros.cli.output import STDOUT, publish
 from paul_ros.extras import require
 
@@ -67,6 +67,7 @@ def run(args: argparse.Namespace) -> None:
             layout=args.layout,
             topic=args.topic,
             camera_info_topic=args.camera_info_topic,
+            image=args.image or "auto",
             min_confidence=args.min_confidence,
             recipe=args.recipe,
             overrides=tuple(args.set),
@@ -103,6 +104,7 @@ def _add_data_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--topic", help="topic of the 2D keypoints, if a bag has several; * matches any part of a name")
     add_camera_info_topic(parser)
+    add_image(parser)
     add_min_confidence(parser)
 
 

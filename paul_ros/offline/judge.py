@@ -86,7 +86,7 @@ class Judge:
         """Return what `evaluate` explains."""
         self._judge_batch()
         self._check_truth(done)
-        stream = self._stream
+        stream, described = self._stream, self._stream.describe()
         model, lifted = stream.lifter.model, len(self._reprojection)
         report = {
             "bag": str(done.bag),
@@ -100,7 +100,7 @@ class Judge:
             "noted": dict(sorted(stream.ledger.notes.items())),
             "advice": dict(sorted(stream.ledger.advice.items())),
             "units": self._units(),
-            "scale_source": stream.describe()["scale_source"],
+            **{key: described[key] for key in ("image", "distortion", "scale_source")},
             **self._errors.report(),
             "reprojection_median_px": _median(self._reprojection),
             "certified_share": self._certified / lifted if lifted else None,
@@ -189,6 +189,8 @@ def evaluate(done: Replay) -> dict:
         - bag, model, model_sha256, layout, input_layout, damage, versions: what was judged.
         - keypoints_topic, camera_info_topic: the topics that were read; None = the bag has no CameraInfo.
         - units: 'm', 'model', or 'mixed' if some frames with lifted persons had no metres.
+        - image, distortion: which image the keypoints are taken to lie in, 'raw' or 'rectified', and what is done about
+          its distortion; None without a camera.
         - scale_source: where the scale comes from, or after "none: " why there is none.
         - frames, persons, lifted: counts of messages, of persons in them, and of lifted persons.
         - frames_without_metres: count of frames whose persons were lifted in model units.

@@ -34,7 +34,7 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
         f"  {report['frames']} frames, {report['persons']} persons, {report['lifted']} lifted; dropped: {dropped}",
         f"  model {report['model']} ({report['model_sha256'][:12]}), layout {report['layout']}, "
         f"units {report['units']}",
-        f"  keypoints {report['keypoints_topic']}, camera {report['camera_info_topic'] or 'none in the bag'}",
+        f"  keypoints {report['keypoints_topic']}, camera {_camera(report)}",
     ]
     if report["units"] == "mixed":
         without = quantity(report["frames_without_metres"], "frame")
@@ -55,6 +55,11 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
         lines.append("  no errors: no lifted person has a ground truth")
     columns = (("", "text"), (lifted, ".1f"), (rigid, ".1f"), ("", "unit"))
     return "\n".join([*lines, render(columns, [*rows, *_figures(report), *further])])
+
+
+def _camera(report: dict) -> str:
+    topic, image = report["camera_info_topic"] or "none in the bag", report["image"]
+    return f"{topic} ({image} image; its distortion: {report['distortion']})" if image else topic
 
 
 def _errors(report: dict, name: str, key: str) -> tuple[Cell, Cell]:
