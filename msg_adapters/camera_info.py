@@ -66,7 +66,7 @@ def read_camera_info(msg: Any, image: str = "auto") -> Intrinsics:
         notes.append(Note("image_assumed", _ASSUMED))
     if image != "rectified" and not distorted and len(msg.d) and str(msg.distortion_model) == EQUIDISTANT:
         notes.append(Note("image_assumed", _NO_FISHEYE))
-    if image == "rectified" and not filled:
+    if image == "rectified" and not filled and distorted:
         notes.append(Note("rectified_without_p", _WITHOUT_P))
     distortion, uncorrected = _distortion(msg) if taken == "raw" else (None, "")
     if uncorrected:

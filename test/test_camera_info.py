@@ -161,6 +161,7 @@ COPIED = (FOCAL + 0.004, FOCAL, CENTRE[0], CENTRE[1] - 0.004)
         ("rectified", OTHER, BARREL, ("P", "rectified", "", [])),
         ("rectified", FILLED, BARREL, ("P", "rectified", "", [])),
         ("rectified", (0, 0, 0, 0), BARREL, ("K", "rectified", "", ["rectified_without_p"])),
+        ("rectified", (0, 0, 0, 0), [], ("K", "rectified", "", [])),
         ("raw", OTHER, BARREL, ("K", "raw", "plumb_bob", [])),
         # Distortion that cannot be used.
         ("raw", OTHER, [0.1, 0.2, 0.3], ("K", "raw", "", ["distortion_ignored"])),
