@@ -4,6 +4,7 @@
 import argparse
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -296,6 +297,20 @@ def test_the_image_of_a_bags_keypoints_is_chosen(barrel_bag, tmp_path):
     assert not np.allclose(raw.W, plain.W, atol=0.01)  # the distortion is corrected
     train(barrel_bag, "-o", tmp_path / "m.npz", "--image", "raw", *SMALL)
     assert not load_model(tmp_path / "m.npz").header["training"]["notes"]
+
+
+@pytest.mark.parametrize(
+    "factor, note", [(1.0, ""), (2.0, "Keypoints reach to .* an image of 640x360: .* Set --camera-info-topic to that")]
+)
+def test_a_resized_image_is_noted(tmp_path, factor, note):
+    """CameraInfo of an image of half the size: all distances would be wrong by the factor."""
+    with BagWriter(tmp_path / "small.mcap") as out:
+        for topic, _, message, stamp in read_messages(BAG, {"/camera_info", "/keypoints"}):
+            if topic == "/camera_info":
+                message = replace(message, width=round(message.width / factor), height=round(message.height / factor))
+            out.write(topic, message, stamp)
+    notes = load_training_data(tmp_path / "small.mcap", COCO).notes
+    assert re.match(note, " ".join(notes)) and bool(notes) == bool(note)
 
 
 def test_keypoints_without_a_ray_are_counted(tmp_path):

@@ -16,6 +16,8 @@ from paul_ros.errors import BagError
 from paul_ros.extras import require
 from paul_ros.layout import Layout
 from paul_ros.placement import centred_view
+from paul_ros.stream.image_bounds import ImageBounds
+from paul_ros.stream.ledger import Ledger
 from paul_ros.wording import quantity
 from training.data import RawFrames
 from training.errors import DataError
@@ -91,6 +93,8 @@ def read_bag(
         raise DataError(f"'{path}' has 2D keypoints on {', '.join(sorted(frames))}: choose one with --topic")
     ((name, messages),) = frames.items()
     notes = _losses(recording, {what: last for what, last in refused.items() if matches(what[0], name)})
+    if cameras.image_size:
+        notes += _bounds_notes([message for _, message in messages], min_confidence, cameras.image_size)
     if cameras.intrinsics:
         seen = sum(int(message.visible.sum()) for _, message in messages)
         messages = [(time, msg_adapters.in_pinhole(message, cameras.at(time))) for time, message in messages]
@@ -109,13 +113,30 @@ def read_bag(
 def _camera_notes(cameras: _Cameras, without_ray: int) -> tuple[str, ...]:
     """Return notes of what was assumed about the cameras, and of points that their distortion hides."""
     assumed = dict.fromkeys(note.text for _, camera in cameras.intrinsics for note in camera.notes)
-    notes = [text.replace("`image`", "--image") for text in assumed]
+    notes = [_in_options(text) for text in assumed]
     if without_ray:
         notes.append(
             f"{quantity(without_ray, 'keypoint')} hidden: the distortion model has no ray there. If they are many, "
             "calibrate the camera with images that reach to its borders"
         )
     return tuple(notes)
+
+
+def _bounds_notes(
+    messages: list[msg_adapters.Keypoints2D], min_confidence: float, size: tuple[int, int]
+) -> tuple[str, ...]:
+    """Return notes of keypoints outside the image that CameraInfo states: their rays are wrong by a factor."""
+    bounds, ledger = ImageBounds(), Ledger()
+    for message in messages:
+        bounds.check(message, min_confidence, size, ledger)
+    return tuple(_in_options(text) for text in ledger.advice.values())
+
+
+def _in_options(advice: str) -> str:
+    """Put the options of `paul train` in place of the node's parameters and topics."""
+    for name, option in (("Remap `camera_info`", "Set --camera-info-topic"), ("`image`", "--image")):
+        advice = advice.replace(name, option).replace(name[0].lower() + name[1:], option[0].lower() + option[1:])
+    return advice
 
 
 def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrinsics]) -> np.ndarray:
