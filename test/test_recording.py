@@ -511,6 +511,19 @@ def test_other_storages_name_the_command(tmp_path, content, clue):
             list(read_records(given))
 
 
+def test_a_recording_of_any_name_is_inspected(tmp_path):
+    file = write(tmp_path / "rec.mcap.bak", [word(1)])
+    assert inspect(str(file))[0]["messages"] == 1
+
+
+def test_a_packed_file_is_not_for_the_tools_of_mcap(tmp_path):
+    content = write(tmp_path / "rec.mcap", [word(n, padding=5000) for n in range(99)]).read_bytes()
+    packed = zstandard.ZstdCompressor().compress(content[:-2000])
+    for name, data, advised in (("a.mcap", content[:-2000], True), ("a.mcap.zstd", packed, False)):
+        (tmp_path / name).write_bytes(data)
+        assert ("`mcap recover" in str(numbers(tmp_path / name)[1])) == advised
+
+
 def test_what_is_no_file(tmp_path):
     os.mkfifo(tmp_path / "pipe.mcap")
     (tmp_path / "loop.mcap").symlink_to("loop.mcap")

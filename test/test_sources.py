@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from tiny_data import sequence
 
+from paul_ros.errors import BagError
 from paul_ros.model_file import load_model, save_model
+from paul_ros.offline.bag_writer import BagWriter
 from training.errors import DataError
 from training.options import TrainingOptions
 from training.preflight import prepare
@@ -44,6 +46,23 @@ def test_motion_capture_is_a_folder_of_its_files_that_is_no_bag(tmp_path):
 def test_a_folder_without_data_is_explained(tmp_path):
     options = TrainingOptions(data=(tmp_path,), model=tmp_path / "m.npz", recipe="default")
     with pytest.raises(DataError, match=r"no recording in this folder \(.mcap, .db3\), and no motion capture"):
+        prepare(options)
+
+
+@pytest.mark.parametrize("name, clue", [("old.bag", "rosbags-convert"), ("take/rec_0.mcap", "`paul replay .*/take`")])
+def test_a_folder_gets_the_advice_that_replay_gives(tmp_path, name, clue):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
+    options = TrainingOptions(data=(tmp_path,), model=tmp_path / "m.npz", recipe="default")
+    with pytest.raises(BagError, match=clue):
+        prepare(options)
+
+
+def test_a_bag_without_keypoints_is_not_a_question_of_the_layout(tmp_path):
+    with BagWriter(tmp_path / "empty.mcap"):
+        pass
+    options = TrainingOptions(data=(tmp_path / "empty.mcap",), model=tmp_path / "m.npz", recipe="default")
+    with pytest.raises(DataError, match="has no 2D keypoints; the bag holds no messages. Record a topic of"):
         prepare(options)
 
 

@@ -167,14 +167,18 @@ def _losses(recording: Recording, refused: dict[tuple[str, str], tuple[int, str]
 
 
 def _check_topic(path: Path, topic: str | None) -> None:
-    """Raise DataError if a bag has no messages of 2D keypoints on a topic."""
+    """Raise DataError if a bag has no messages of 2D keypoints, on a topic or at all."""
     from paul_ros.offline.bag_reader import matches, topics_of
 
     topics = {name: kind for name, (kind, _) in topics_of(path).items()}
-    if not topic or any(matches(name, topic) and kind in msg_adapters.SUPPORTED for name, kind in topics.items()):
+    if any(matches(name, topic or name) and kind in msg_adapters.SUPPORTED for name, kind in topics.items()):
         return
-    held = ", ".join(f"{name} ({kind})" for name, kind in topics.items())
-    raise DataError(f"'{path}' has no 2D keypoints on {topic}; the bag holds {held or 'none at all'}. Choose --topic")
+    held = ", ".join(f"{name} ({kind})" for name, kind in topics.items()) or "no messages"
+    if topic:
+        raise DataError(f"'{path}' has no 2D keypoints on {topic}; the bag holds {held}. Choose --topic")
+    raise DataError(
+        f"'{path}' has no 2D keypoints; the bag holds {held}. Record a topic of {' or '.join(msg_adapters.SUPPORTED)}"
+    )
 
 
 def _bag_keypoints(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from paul_ros.layout import load_layout
-from paul_ros.offline.bag_folder import METADATA, bag_files
+from paul_ros.offline.bag_folder import METADATA, bag_files, is_bag
 from training.categories import load_files
 from training.data import TrainingData
 from training.errors import DataError
@@ -39,8 +39,8 @@ def load_keypoints(options: TrainingOptions) -> TrainingData:
 
 
 def _check_folder(path: Path) -> None:
-    """Raise DataError if the path is a folder without recordings."""
-    if path.is_dir() and not (path / METADATA).exists() and not bag_files(path):
+    """Raise DataError if the path is a folder without anything that may be a recording."""
+    if path.is_dir() and not any(is_bag(child) for child in path.iterdir()):
         raise DataError(
             f"{path}: no recording in this folder (.mcap, .db3), and no motion capture (.asf with .amc, .bvh, .npz)"
         )

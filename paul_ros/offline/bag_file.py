@@ -53,6 +53,7 @@ class BagFile:
     Attributes:
         path: of the file.
         refusal: why nothing of the file can be read, and what to do; '' = it can be read.
+        packed: whether the whole file is compressed; then tools of mcap cannot read it.
         compression: 'file: zstd', 'messages: zstd', 'chunks: zstd' or 'chunks: lz4'; '' = none.
     """
 
@@ -61,14 +62,14 @@ class BagFile:
         self.path = path
         self.refusal = ""
         self.compression = ""
-        self._packed = False
+        self.packed = False
         self._pack_damage = ""
         self._storage: Storage | None = None
         try:
             if not stat.S_ISREG(path.stat().st_mode):
                 self.refusal = "not a regular file; copy the recording to a file first"
             else:
-                self._packed = _head(path).startswith(_ZSTD_MAGIC)
+                self.packed = _head(path).startswith(_ZSTD_MAGIC)
                 with self._unpacked() as plain:
                     self._open(plain)
                 if self._pack_damage:
@@ -82,14 +83,14 @@ class BagFile:
             self._storage = McapFile(plain)
         elif head.startswith(sqlite_file.MAGIC):
             self._storage = SqliteFile(plain)
-        elif not head and not self._packed:
+        elif not head and not self.packed:
             self.refusal = "the file is empty (0 bytes); the recording never began"
         elif head.startswith(_ROS1_MAGIC):
             name = self.path.stem
             self.refusal = (
                 f"a ROS 1 bag; convert it with `rosbags-convert --src {self.path} --dst {name} --dst-storage mcap`"
             )
-        elif self._packed and (self._pack_damage or not head):
+        elif self.packed and (self._pack_damage or not head):
             self.refusal = f"the compressed file is damaged ({self._pack_damage or 'it ends too early'})"
         else:
             self.refusal = f"not an mcap or sqlite3 file; {conversion(self.path)}"
@@ -157,7 +158,7 @@ class BagFile:
 
         The unpacked file lives as long as the block: the files of a recording are unpacked one after the other.
         """
-        if not self._packed:
+        if not self.packed:
             yield self.path
             return
         import zstandard
@@ -191,6 +192,14 @@ class BagFile:
         if stated is None:
             return quantity(self.messages, "whole message")
         return f"All {stated} messages" if self.messages == stated else f"{self.messages} of {stated} messages"
+
+
+def starts_as_recording(path: Path) -> bool:
+    """Return whether a path is a file that begins as those of rosbag2 or ROS 1 do, whatever its name."""
+    try:
+        return path.is_file() and _head(path).startswith((mcap_frames.MAGIC, sqlite_file.MAGIC, _ROS1_MAGIC))
+    except OSError:
+        return False
 
 
 def conversion(path: Path) -> str:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import yaml
 
+from paul_ros.offline.bag_file import starts_as_recording
+
 METADATA = "metadata.yaml"
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
@@ -25,8 +27,9 @@ _MAX_GAPS = 1000  # missing numbers between the splits of one recording
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path looks like a bag: a folder, metadata.yaml, or a file with the ending of a recording."""
-    return path.is_dir() or path.name == METADATA or path.name.endswith((*SUFFIXES, *_OTHER_SUFFIXES))
+    """Return whether a path looks like a bag: a folder, metadata.yaml, or a file that is named or begins as one."""
+    named = path.is_dir() or path.name == METADATA or path.name.endswith((*SUFFIXES, *_OTHER_SUFFIXES))
+    return named or starts_as_recording(path)
 
 
 def bag_files(folder: Path) -> list[Path]:

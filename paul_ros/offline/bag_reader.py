@@ -159,7 +159,7 @@ def topics_of(path: str | Path) -> dict[str, tuple[str, int]]:
 def _damage_of_file(file: BagFile) -> str:
     if file.refusal:
         return f"{file.path}: {file.refusal}"
-    advice = f", or try `mcap recover {file.path.name}`" if file.storage == "mcap" else ""
+    advice = f", or try `mcap recover {file.path.name}`" if file.storage == "mcap" and not file.packed else ""
     return f"{file.path}: damaged: {file.damage}. {file.whole_messages} were read. Record it again{advice}"
 
 
