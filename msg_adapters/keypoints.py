@@ -19,8 +19,13 @@ MAX_PIXELS = 1e6
 _NORMALISED = 3.0
 #: Fewest visible points that show it.
 _LEAST_POINTS = 3
-#: Detectors' peaks exceed 1 slightly; a confidence farther outside 0..1 is noted.
-CONFIDENCE_SLACK = 0.05
+#: A confidence farther outside 0..1 is noted: peaks of RTMPose reach 1.12, of RSN 1.28 (MMPose, issues 3122 and 884).
+CONFIDENCE_SLACK = 0.3
+#: Names of a field, a column or an array with confidences: the contract's, then what detectors call it.
+CONFIDENCE_NAMES = (
+    "confidence", "score", "visibility", "conf", "likelihood", "probability", "presence", "prob", "certainty",
+    "confidences", "scores", "keypoint_scores", "c",
+)  # fmt: skip
 
 
 class MessageError(ValueError):

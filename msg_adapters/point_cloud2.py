@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from msg_adapters.keypoints import (
+    CONFIDENCE_NAMES,
     Keypoints2D,
     MessageError,
     Note,
@@ -29,11 +30,6 @@ from msg_adapters.keypoints import (
 #: sensor_msgs/PointField datatype -> numpy type without byte order.
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
-#: Names of the field with the confidences: the contract's, then what detectors call it.
-_CONFIDENCE_NAMES = (
-    "confidence", "score", "visibility", "conf", "likelihood", "probability", "presence", "prob", "certainty", "c",
-)  # fmt: skip
-
 
 def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     """Read a cloud of 2D keypoints; an empty cloud is an image without persons.
@@ -46,7 +42,7 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     # Check sizes first: numpy cannot make a structured type with an absurd point_step.
     row_step = _row_step(msg)
     fields = {field.name: field for field in msg.fields}
-    confidence_name = next((name for name in _CONFIDENCE_NAMES if name in fields), None)
+    confidence_name = next((name for name in CONFIDENCE_NAMES if name in fields), None)
     dtype = _point_type(msg, fields, confidence_name)
     cloud: np.ndarray = np.ndarray((msg.height, msg.width), dtype, buffer=msg.data, strides=(row_step, msg.point_step))
     cloud = _persons_first(cloud, points, source)

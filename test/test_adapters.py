@@ -288,13 +288,13 @@ def test_pose_array_of_nobody(make):
 
 
 def test_pose_array_confidence_a_little_above_one_is_clipped(make):
-    confidence = np.array([1.05, 1.01, 1, 0.5, 0.9])[None, :, None]
+    confidence = np.array([1.28, 1.11, 1, 0.5, 0.9])[None, :, None]
     got = read(POSES, poses_of(make, np.concatenate([some_points(1), confidence], axis=-1)), P)
     np.testing.assert_array_equal(got.confidence, [[1, 1, 1, 0.5, 0.9]])
     assert got.visible.all()
 
 
-@pytest.mark.parametrize("z", [1.06, 1.7, -0.2, np.inf])
+@pytest.mark.parametrize("z", [1.31, 1.7, -0.2, np.inf])
 def test_pose_array_that_is_3d(make, z):
     xyz = np.concatenate([some_points(), np.zeros((2, P, 1))], axis=-1)
     xyz[1, 3, 2] = z
@@ -361,7 +361,7 @@ def test_placeholders_are_missing_in_every_family(make, x, y):
         assert read(type_name, make.through_cdr(msg), P).visible.tolist() == [[True, True, False, True, True]]
 
 
-@pytest.mark.parametrize("confidence", [[0, 34, 87.5, 99, 100], [-4.1, 2.2, 0.3, 5, -0.2], [0.9, 0.8, 1.2, 0.7, 1]])
+@pytest.mark.parametrize("confidence", [[0, 34, 87.5, 99, 100], [-4.1, 2.2, 0.3, 5, -0.2], [0.9, 0.8, 1.4, 0.7, 1]])
 def test_confidences_outside_0_to_1_are_noted(make, confidence):
     """Percentages, logits, and peaks far over 1."""
     got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1) * 9), "confidence": np.array([confidence])}), P)
@@ -371,7 +371,14 @@ def test_confidences_outside_0_to_1_are_noted(make, confidence):
 
 
 @pytest.mark.parametrize(
-    "confidence", [[0, 0.5, 1, 1.05, 0.9], [-1, -1, 0.5, 0.6, 1], [np.nan, -0.01, 1, 1, 1], [0, 1, 2, 2, 0]]
+    "confidence",
+    [
+        [0, 0.5, 1, 1.05, 0.9],
+        [0.87, 1.112, 0.95, 1.28, 1.01],
+        [-1, -1, 0.5, 0.6, 1],
+        [np.nan, -0.01, 1, 1, 1],
+        [0, 1, 2, 2, 0],
+    ],
 )
 def test_usual_confidences_are_not_noted(make, confidence):
     columns = {**xy_columns(some_points(1) * 9), "confidence": np.array([confidence])}
@@ -384,7 +391,7 @@ def test_percentages_in_a_pose_array_are_refused_as_such(make):
         read(POSES, poses_of(make, xyz), P)
 
 
-@pytest.mark.parametrize("name", ["score", "visibility", "conf", "likelihood", "probability", "c"])
+@pytest.mark.parametrize("name", ["score", "visibility", "conf", "likelihood", "probability", "keypoint_scores", "c"])
 def test_a_confidence_by_another_name_is_used(make, name):
     confidence = np.linspace(0.1, 0.9, P)[None]
     got = read(CLOUD, cloud_of(make, {**xy_columns(some_points(1) * 9), name: confidence}), P)

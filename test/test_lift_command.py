@@ -607,3 +607,51 @@ def test_normalised_keypoints_and_odd_confidences_are_said(tmp_path, capsys):
     assert "normalised to 0..1" in printed and "divide percentages by 100" in printed
     assert lift(source, tmp_path / "o.npz", "human", "--intrinsics", 600, 600, 320, 240) == 1
     assert "degenerate_points" in (refusal := capsys.readouterr().err) and "image's width" in refusal
+
+
+@pytest.mark.parametrize("name", ["score", "visibility", "conf", "keypoint_scores"])
+@pytest.mark.parametrize("kind", ["npz", "csv", "json"])
+def test_confidences_by_another_name_are_used(kind, name, persons, tmp_path, capsys):
+    """Half of each person is below the threshold."""
+    scores = np.where(np.arange(17) < 8, 0.05, 0.9) * np.ones((len(persons), 1))
+    points = np.nan_to_num(persons, nan=300.0)
+    results = []
+    for key in ("confidence", name):
+        source, out = tmp_path / f"{key}.{kind}", tmp_path / f"{key}.out.npz"
+        if kind == "npz":
+            npz(source, keypoints=points, **{key: scores})
+        elif kind == "csv":
+            rows = zip(np.ndindex(scores.shape), points.reshape(-1, 2), scores.ravel())
+            lines = [f"{frame},{COCO[point]},{x},{y},{score}" for (frame, point), (x, y), score in rows]
+            source.write_text("\n".join([f"frame,keypoint,x,y,{key}", *lines]))
+        else:
+            source.write_text(
+                json.dumps([[{"keypoints": p.tolist(), key: s.tolist()}] for p, s in zip(points, scores)])
+            )
+        assert lift(source, out, "human") == 0
+        results.append(read(out)["points"])
+        assert "not used" not in capsys.readouterr().out
+    np.testing.assert_array_equal(*results)
+    npz(tmp_path / "without.npz", keypoints=points)
+    assert lift(tmp_path / "without.npz", tmp_path / "without.out.npz", "human") == 0
+    assert not np.array_equal(read(tmp_path / "without.out.npz")["points"], results[0])
+
+
+def test_confidences_that_are_not_used_are_named(persons, tmp_path, capsys):
+    points, scores = np.nan_to_num(persons, nan=300.0), np.ones((len(persons), 17))
+    person = {"keypoints": np.column_stack([points[0], scores[0]]).tolist(), "scores": scores[0].tolist(), "score": 0.9}
+    npz(tmp_path / "two.npz", keypoints=points, confidence=scores, score=scores)
+    npz(tmp_path / "beside.npz", keypoints=np.dstack([points, scores]), scores=scores)
+    npz(tmp_path / "person.npz", keypoints=points, score=scores[:, 0])
+    (tmp_path / "beside.json").write_text(json.dumps([[person]]))
+    unused = {"two.npz": "score", "beside.npz": "scores", "person.npz": "score", "beside.json": "scores"}
+    for name, left_out in unused.items():
+        assert lift(tmp_path / name, tmp_path / "out.npz", "human") == 0
+        assert f"note: {left_out} not used; keep one" in capsys.readouterr().out, name
+
+
+def test_confidences_of_another_number_are_refused(persons, tmp_path, capsys):
+    person = {"keypoints": np.nan_to_num(persons[0]).tolist(), "keypoint_scores": [0.5, 0.6]}
+    (tmp_path / "in.json").write_text(json.dumps([[person]]))
+    assert lift(tmp_path / "in.json", tmp_path / "out.npz", "human") == 1
+    assert "frame 0, person 0: keypoint_scores has 2 numbers for 17 keypoints" in capsys.readouterr().err

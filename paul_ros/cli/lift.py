@@ -41,7 +41,8 @@ _EPILOG = """\
 input, N persons of P keypoints in pixels (x right, y down), NaN where hidden:
   npz:   keypoints (N,P,2), or (N,P,3) with the confidences, or W (F,2,P) as
          for `paul train`; optional visible (N,P), confidence (N,P), frame (N,)
-         and person (N,).
+         and person (N,). Without confidence, score, visibility and the like
+         are read, also in csv and json.
   csv:   a row for each keypoint, with the columns frame,keypoint,x,y and
          optional person,confidence. A keypoint is a name or, with --layout, a
          number from 0 on. It is hidden if it has no row, or no x and y.

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
@@ -22,6 +22,8 @@ from paul_ros.stream.session import Session
 _NORMALISED = (
     "keypoints look normalised to 0..1; multiply x by the image's width and y by its height, or poses are distorted"
 )
+
+_UNUSED = "{} not used; keep one array or column of confidences (0 to 1), as confidence"
 
 _NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 
@@ -54,6 +56,7 @@ class Persons:
         xy: np.ndarray,
         confidence: np.ndarray | None = None,
         visible: np.ndarray | None = None,
+        unused: Sequence[str] = (),
     ) -> Persons:
         """Hide what no camera can have seen, by the rules for messages, and placeholders.
 
@@ -63,12 +66,15 @@ class Persons:
             xy: (N,P,2) pixels, of any real type.
             confidence: (N,P), or None if the source has none.
             visible: (N,P) bool, or None if hidden points are NaN.
+            unused: names in the source that look like confidences too.
         """
         shown = np.isfinite(xy).all(axis=2) if visible is None else visible
         missing = placeholders(xy[..., 0], xy[..., 1], shown)
         read = record(xy, confidence, person, _NO_HEADER, shown & ~missing, placeholders=False)
         seen = int(read.visible.sum())
         notes = {note.reason: (note.text, seen) for note in read.notes}
+        if unused:
+            notes["unused_confidences"] = _UNUSED.format(", ".join(unused)), seen
         if missing.any():
             notes["placeholder"] = "points at (0, 0) or (-1, -1) are taken as missing", int(missing.sum())
         if look_normalised(read.xy[..., 0], read.xy[..., 1], read.visible):
@@ -76,10 +82,12 @@ class Persons:
         return cls(frame, person, read.xy, read.confidence, read.visible, notes)
 
     @classmethod
-    def stacked(cls, frame: list[int], person: list[str], keypoints: list[np.ndarray]) -> Persons:
+    def stacked(
+        cls, frame: list[int], person: list[str], keypoints: list[np.ndarray], unused: Sequence[str] = ()
+    ) -> Persons:
         """Stack N persons' x, y, confidence, arrays (P,3); NaN where hidden."""
         every = np.stack(keypoints)
-        return cls.of(np.array(frame), tuple(person), every[..., :2], every[..., 2])
+        return cls.of(np.array(frame), tuple(person), every[..., :2], every[..., 2], unused=unused)
 
 
 def layout_of(points: int, model: Layout) -> Layout:

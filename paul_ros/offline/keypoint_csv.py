@@ -3,22 +3,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from msg_adapters.keypoints import CONFIDENCE_NAMES
 from paul_ros.errors import KeypointFileError, LayoutError
 from paul_ros.layout import Layout, layout_names, load_layout
 from paul_ros.offline.arrays import Persons
 from paul_ros.stream.layout_search import PREFERRED
 
 _MAX_FRAME = 2**63  # of an int64
-_NEEDED, _OPTIONAL = ("frame", "keypoint", "x", "y"), ("person", "confidence")
-_COLUMNS = f"{','.join(_NEEDED)} and, if there are any, {' and '.join(_OPTIONAL)}"
+_NEEDED = ("frame", "keypoint", "x", "y")
+_COLUMNS = f"{','.join(_NEEDED)} and, if there are any, person and confidence"
 
 
 class _Row(NamedTuple):
@@ -46,32 +48,56 @@ def read_csv(file: BinaryIO, layout: Layout | None, batch: int) -> tuple[Layout,
         KeypointFileError: the table cannot be used; names the line. Also raised while the batches are read.
         LayoutError: no shipped layout has the keypoints of the first frame, or they are numbered.
     """
-    frames = _frames(_rows(csv.reader(io.TextIOWrapper(file, "utf-8-sig", newline=""), strict=True)))
+    lines = csv.reader(io.TextIOWrapper(file, "utf-8-sig", newline=""), strict=True)
+    with _csv_errors(lines):
+        header = next(lines, [])
+    place = _places(header)
+    confidence, unused = _confidence_columns(place)
+    frames = _frames(_rows(lines, place, confidence, len(header)))
     first = next(frames, None)
     if first is None:
         raise KeypointFileError(f"holds no keypoints: write rows of {_COLUMNS}")
     layout = layout or _layout_naming(first)
-    return layout, _batches(itertools.chain([first], frames), layout, batch)
+    return layout, _batches(itertools.chain([first], frames), layout, batch, unused)
 
 
-def _rows(lines: Any) -> Iterator[_Row]:
+@contextlib.contextmanager
+def _csv_errors(lines: Any) -> Iterator[None]:
+    """Name the line of a text that is no table."""
     try:
-        header = [name.strip().lower() for name in next(lines, [])]
-        place = {name: index for index, name in enumerate(header)}
-        twice = sorted({name for name in (*_NEEDED, *_OPTIONAL) if header.count(name) > 1})
-        if twice:
-            raise KeypointFileError(f"has the column {twice[0]} twice: keep one of them")
-        missing = [name for name in _NEEDED if name not in place]
-        if missing:
-            found = ",".join(header)[:100] or "none"
-            raise KeypointFileError(f"lacks {', '.join(missing)} in its columns ({found}): they must be {_COLUMNS}")
-        person, confidence = place.get("person"), place.get("confidence")
+        yield
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise KeypointFileError(f"line {lines.line_num + 1} is not CSV in UTF-8 ({error})") from error
+
+
+def _places(cells: list[str]) -> dict[str, int]:
+    """Return the index of each column by its name."""
+    header = [name.strip().lower() for name in cells]
+    twice = sorted({name for name in (*_NEEDED, "person", *CONFIDENCE_NAMES) if header.count(name) > 1})
+    if twice:
+        raise KeypointFileError(f"has the column {twice[0]} twice: keep one of them")
+    missing = [name for name in _NEEDED if name not in header]
+    if missing:
+        found = ",".join(header)[:100] or "none"
+        raise KeypointFileError(f"lacks {', '.join(missing)} in its columns ({found}): they must be {_COLUMNS}")
+    return {name: index for index, name in enumerate(header)}
+
+
+def _confidence_columns(place: dict[str, int]) -> tuple[str, list[str]]:
+    """Return the name of the column with the confidences, '' if there is none, and other names that look like it."""
+    named = [name for name in CONFIDENCE_NAMES if name in place]
+    return (named[0], named[1:]) if named else ("", [])
+
+
+def _rows(lines: Any, place: dict[str, int], confidence_name: str, width: int) -> Iterator[_Row]:
+    person, confidence = place.get("person"), place.get(confidence_name)
+    with _csv_errors(lines):
         for cells in lines:
             if not cells:
                 continue
             line = lines.line_num
-            if len(cells) != len(header):
-                raise KeypointFileError(f"line {line} has {len(cells)} cells; it must have {len(header)}")
+            if len(cells) != width:
+                raise KeypointFileError(f"line {line} has {len(cells)} cells; it must have {width}")
             yield _Row(
                 line,
                 _frame_number(cells[place["frame"]], line),
@@ -81,8 +107,6 @@ def _rows(lines: Any) -> Iterator[_Row]:
                 _coordinate(cells[place["y"]], "y", line),
                 _coordinate(cells[confidence], "confidence", line) if confidence is not None else 1.0,
             )
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise KeypointFileError(f"line {lines.line_num + 1} is not CSV in UTF-8 ({error})") from error
 
 
 def _frame_number(text: str, line: int) -> int:
@@ -126,7 +150,7 @@ def _layout_naming(rows: list[_Row]) -> Layout:
     raise LayoutError(f"no shipped layout has all of {', '.join(sorted(names))[:200]}: name one with --layout")
 
 
-def _batches(frames: Iterable[list[_Row]], layout: Layout, batch: int) -> Iterator[Persons]:
+def _batches(frames: Iterable[list[_Row]], layout: Layout, batch: int, unused: Sequence[str]) -> Iterator[Persons]:
     index = {name: place for place, name in enumerate(layout.names)}
     index.update((str(place), place) for place in range(len(layout.names)))
     frame: list[int] = []
@@ -138,10 +162,10 @@ def _batches(frames: Iterable[list[_Row]], layout: Layout, batch: int) -> Iterat
         person += persons
         values += persons.values()
         if len(values) >= batch:
-            yield Persons.stacked(frame, person, values)
+            yield Persons.stacked(frame, person, values, unused)
             frame, person, values = [], [], []
     if values:
-        yield Persons.stacked(frame, person, values)
+        yield Persons.stacked(frame, person, values, unused)
 
 
 def _persons_of(rows: list[_Row], layout: Layout, index: dict[str, int]) -> dict[str, np.ndarray]:

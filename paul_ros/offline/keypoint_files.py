@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from msg_adapters.keypoints import CONFIDENCE_NAMES
 from paul_ros.errors import KeypointFileError, LayoutError, NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout
@@ -74,12 +75,12 @@ def _named_batches(name: str, batches: Iterator[Persons]) -> Iterator[Persons]:
 
 
 def _open_npz(file: BinaryIO, layout: Layout | None, model: Layout) -> KeypointFile:
-    names = ("keypoints", "W", "visible", "confidence", "frame", "person")
+    names = ("keypoints", "W", "visible", "frame", "person", *CONFIDENCE_NAMES)
     arrays = read_npz(io.BytesIO(file.read()) if not file.seekable() else file, (), names)
     xy, confidence = _points(arrays)
     count, points = xy.shape[:2]
     layout = _checked_layout(layout, points, model)
-    confidence = _array(arrays, "confidence", (count, points), "number") if confidence is None else confidence
+    confidence, unused = _confidences(arrays, (count, points), confidence)
     visible = _flags(arrays, "visible", (count, points))
     frame = _array(arrays, "frame", (count,), "integer")
     person = _array(arrays, "person", (count,), "text")
@@ -95,6 +96,7 @@ def _open_npz(file: BinaryIO, layout: Layout | None, model: Layout) -> KeypointF
                 xy[rows],
                 None if confidence is None else confidence[rows],
                 None if visible is None else visible[rows],
+                unused,
             )
 
     return KeypointFile(layout, count, batches())
@@ -117,6 +119,18 @@ def _points(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray | Non
         _check_anybody(len(W))
         return W.transpose(0, 2, 1), None
     raise KeypointFileError("has neither keypoints (N,P,2) nor W (F,2,P): save one with np.savez")
+
+
+def _confidences(
+    arrays: dict[str, np.ndarray], shape: tuple[int, int], beside: np.ndarray | None
+) -> tuple[np.ndarray | None, list[str]]:
+    """Return the confidences (N,P), those beside the coordinates first, and the names of arrays left unused."""
+    named = [name for name in CONFIDENCE_NAMES if name in arrays]
+    if beside is not None:
+        return beside, named
+    fitting = [name for name in named if name == "confidence" or arrays[name].shape == shape]
+    unused = [name for name in named if name not in fitting[:1]]
+    return _array(arrays, fitting[0], shape, "number") if fitting else None, unused
 
 
 def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...], kind: str) -> np.ndarray | None:
@@ -165,6 +179,7 @@ def _open_json(file: BinaryIO, layout: Layout | None, model: Layout) -> Keypoint
     where = [(number, place) for number, persons in enumerate(frames) for place in range(len(persons))]
     _check_anybody(len(where))
     number, place = where[0]
+    unused = _unused_lists(frames[number][place])
     layout = _checked_layout(layout, len(_json_person(frames[number][place], number, place)[1]), model)
 
     def batches() -> Iterator[Persons]:
@@ -173,7 +188,8 @@ def _open_json(file: BinaryIO, layout: Layout | None, model: Layout) -> Keypoint
             read = [_json_person(frames[number][place], number, place) for number, place in rows]
             for (number, place), (_, keypoints) in zip(rows, read):
                 _check_points(len(keypoints), layout, f"frame {number}, person {place}: ")
-            yield Persons.stacked([number for number, _ in rows], [name for name, _ in read], [k for _, k in read])
+            numbers, names = [number for number, _ in rows], [name for name, _ in read]
+            yield Persons.stacked(numbers, names, [values for _, values in read], unused)
 
     return KeypointFile(layout, len(where), batches())
 
@@ -182,7 +198,7 @@ def _json_person(person: Any, frame: int, place: int) -> tuple[str, np.ndarray]:
     """Return a person's id and its x, y, confidence (P,3)."""
     name, keypoints = str(place), person
     if isinstance(person, dict):
-        name, keypoints = str(person.get("id", place)), person.get("keypoints")
+        name, keypoints = str(person.get("id", place)), _with_confidences(person, frame, place)
     try:
         if keypoints and all(isinstance(value, (int, float)) for value in keypoints):  # x, y, confidence in a row
             return name, np.array(keypoints, float).reshape(-1, 3)
@@ -191,6 +207,43 @@ def _json_person(person: Any, frame: int, place: int) -> tuple[str, np.ndarray]:
         raise KeypointFileError(
             f"frame {frame}, person {place}: keypoints must be [x, y], [x, y, confidence], or null if hidden"
         ) from None
+
+
+def _with_confidences(person: dict[str, Any], frame: int, place: int) -> Any:
+    """Return the keypoints of a person; confidences in a list of their own, as of MMPose, are put beside x and y.
+
+    Raises:
+        KeypointFileError: their numbers differ.
+    """
+    keypoints: Any = person.get("keypoints")
+    lists = _confidence_lists(person)
+    if not lists or not _are_pairs(keypoints):
+        return keypoints
+    confidences = person[lists[0]]
+    if len(confidences) != len(keypoints):
+        raise KeypointFileError(
+            f"frame {frame}, person {place}: {lists[0]} has {len(confidences)} numbers for {len(keypoints)} keypoints; "
+            "give one for each"
+        )
+    return [point and [*point, value] for point, value in zip(keypoints, confidences)]
+
+
+def _unused_lists(person: Any) -> list[str]:
+    """Return the names of a person's lists that look like confidences and are not used."""
+    if not isinstance(person, dict):
+        return []
+    return _confidence_lists(person)[_are_pairs(person.get("keypoints")) :]
+
+
+def _confidence_lists(person: dict[str, Any]) -> list[str]:
+    return [name for name in CONFIDENCE_NAMES if isinstance(person.get(name), list)]
+
+
+def _are_pairs(keypoints: Any) -> bool:
+    """Return whether keypoints are [x, y] or null, without confidences."""
+    return isinstance(keypoints, list) and all(
+        point is None or (isinstance(point, list) and len(point) == 2) for point in keypoints
+    )
 
 
 def _json_keypoint(keypoint: Any) -> list[float | None]:
