@@ -17,6 +17,7 @@ from msg_adapters.intrinsics import Intrinsics
 from msg_adapters.keypoints import MessageError
 from paul_ros.errors import InputError
 from paul_ros.layout import Layout, layout_names, load_layout
+from paul_ros.placeholders import look_normalised, placeholders
 
 _FOCAL_LENGTHS = (10.0, 1e6)
 """Pixels, limits of plausible focal lengths; a normalised K is below them."""
@@ -58,7 +59,7 @@ def as_points(points: ArrayLike, visible: ArrayLike | None, layout: Layout) -> t
 
     Args:
         points: (N,P,2) or (P,2) pixels, any array or nested list.
-        visible: (N,P) or (P,) bool, or 0 and 1; None for all points with finite coordinates.
+        visible: (N,P) or (P,) bool, or 0 and 1; None for all points with finite coordinates but placeholders.
         layout: layout of the P points.
 
     Returns:
@@ -76,8 +77,14 @@ def as_points(points: ArrayLike, visible: ArrayLike | None, layout: Layout) -> t
             f"person{_advice(xy, layout)}"
         )
     if visible is None:
-        return xy, np.isfinite(xy).all(2)
-    return xy, _as_visibility(visible, given).reshape(xy.shape[:2])
+        seen = np.isfinite(xy).all(2)
+        seen &= ~placeholders(xy[..., 0], xy[..., 1], seen)
+    else:
+        seen = _as_visibility(visible, given).reshape(xy.shape[:2])
+    if look_normalised(xy[..., 0], xy[..., 1], seen):
+        text = "points look normalised to 0..1: multiply x by the image's width and y by its height"
+        warnings.warn(text, stacklevel=3)  # at the caller of Lifter.lift
+    return xy, seen
 
 
 def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
@@ -94,9 +101,10 @@ def as_intrinsics(camera: Camera | None) -> Intrinsics | None:
         return None
     if isinstance(camera, Intrinsics):
         if not _plausible(camera.fx, camera.fy, camera.cx, camera.cy):
+            high = _FOCAL_LENGTHS[1]
             raise InputError(
                 f"camera has fx {camera.fx!r}, fy {camera.fy!r}, cx {camera.cx!r}, cy {camera.cy!r}: pass numbers "
-                f"that are finite, and focal lengths of {_LIMITS} pixels"
+                f"that are finite, focal lengths of {_LIMITS} pixels, and a principal point within {high:g}"
             )
         return camera
     if hasattr(camera, "k") and hasattr(camera, "p"):
@@ -147,7 +155,7 @@ def _plausible(fx: Any, fy: Any, cx: Any, cy: Any) -> bool:
     """Return whether focal lengths and principal point in pixels are numbers of a camera."""
     low, high = _FOCAL_LENGTHS
     are_numbers = all(isinstance(value, numbers.Real) and math.isfinite(value) for value in (fx, fy, cx, cy))
-    return are_numbers and low <= fx <= high and low <= fy <= high
+    return are_numbers and low <= fx <= high and low <= fy <= high and max(abs(cx), abs(cy)) <= high
 
 
 def _as_visibility(visible: ArrayLike, points: np.ndarray) -> np.ndarray:
@@ -167,7 +175,8 @@ def _as_visibility(visible: ArrayLike, points: np.ndarray) -> np.ndarray:
 
 def _as_floats(values: Any, name: str) -> np.ndarray:
     try:
-        return np.asarray(values, float)
+        # A masked value is a hidden one.
+        return np.ma.filled(np.ma.asarray(values, float), np.nan) if np.ma.isMA(values) else np.asarray(values, float)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} of type {type(values).__name__} cannot be an array of numbers: {error}") from None
 

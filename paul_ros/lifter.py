@@ -120,8 +120,8 @@ class Lifter:
 
         Args:
             points: (N,P,2) pixels, or (P,2) for one person; NaN, or any other value, where hidden.
-            visible: (N,P), or (P,) for one person, bool; None for all points with finite coordinates. Points more than
-                a million pixels out are always hidden.
+            visible: (N,P), or (P,) for one person, bool; None for all points with finite coordinates, without (0, 0),
+                (-1, -1) and the like. Points more than a million pixels out are always hidden.
             camera: camera of the image, for output in metres; None for output in model units. It is a
                 sensor_msgs/CameraInfo message, whose distortion is corrected if the image is raw; the rule is that of
                 ``msg_adapters.read_camera_info``. If you know which image it is, pass what that function returns. Or

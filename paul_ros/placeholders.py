@@ -21,6 +21,9 @@ _LEAST_AT_ORIGIN = 0.5
 _NORMALISED = 3.0
 """Coordinates normalised to 0..1 reach as far at most: detectors guess points outside the image too."""
 
+_LEAST_POINTS = 3
+"""Fewest visible points that show it."""
+
 
 def placeholders(x: np.ndarray, y: np.ndarray, visible: np.ndarray) -> np.ndarray:
     """Return which visible points are missing, (F,P) bool.
@@ -39,7 +42,7 @@ def placeholders(x: np.ndarray, y: np.ndarray, visible: np.ndarray) -> np.ndarra
 
 def look_normalised(x: np.ndarray, y: np.ndarray, visible: np.ndarray) -> bool:
     """Return whether the visible points of F frames (F,P) lie within 0..1, as shares of the image's size."""
-    if not visible.any() or _about_an_origin(x, y, visible):
+    if visible.sum() < _LEAST_POINTS or _about_an_origin(x, y, visible):
         return False
     return all(bool((np.abs(values[visible]) <= _NORMALISED).all()) for values in (x, y))
 

@@ -8,6 +8,7 @@ import importlib
 import subprocess
 import sys
 import types
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -256,6 +257,7 @@ def test_a_layout_is_asked_for_by_name_or_path() -> None:
         ({"camera": Intrinsics(-1.0, 600.0, 320.0, 240.0, 640, 480)}, "fx -1.0.*focal lengths of 10 to 1e.06"),
         ({"camera": Intrinsics(600.0, np.nan, 320.0, 240.0, 640, 480)}, "fy nan"),
         ({"camera": Intrinsics(600.0, 600.0, np.inf, 240.0, 640, 480)}, "cx inf"),
+        ({"camera": Intrinsics(600.0, 600.0, 1e9, 240.0, 640, 480)}, "a principal point within 1e.06"),
         ({"camera": Intrinsics("600", 600.0, 320.0, 240.0, 640, 480)}, "fx '600'"),
         ({"camera": "camera.yaml"}, "camera of type str cannot be an array"),
         ({"camera": _camera(k=[0.0] * 9)}, "calibrate the camera"),
@@ -272,6 +274,33 @@ def test_wrong_arguments_are_refused_with_advice(lifter: Lifter, arguments: dict
     with pytest.raises(PaulError, match=advice) as refusal:
         lifter.lift(**given)
     assert isinstance(refusal.value, ValueError) and "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("placeholder", [0.0, -1.0])
+def test_placeholders_are_hidden_unless_visible_says_otherwise(lifter: Lifter, placeholder: float) -> None:
+    marked, hidden = POINTS.copy(), POINTS.copy()
+    marked[0, 5:8], hidden[0, 5:8] = placeholder, np.nan
+    assert_equal(lifter.lift(marked, camera=K, layout="coco17"), lifter.lift(hidden, camera=K, layout="coco17"))
+    every = np.ones(POINTS.shape[:2], bool)
+    seen = lifter.lift(marked, every, K, "coco17")
+    assert not np.array_equal(seen.points, lifter.lift(marked, camera=K, layout="coco17").points)
+
+
+def test_masked_values_are_hidden(lifter: Lifter) -> None:
+    mask = np.zeros(POINTS.shape, bool)
+    mask[0, 5:8] = True
+    hidden = np.where(mask, np.nan, POINTS)
+    masked = np.ma.masked_array(POINTS, mask)
+    assert_equal(lifter.lift(masked, camera=K, layout="coco17"), lifter.lift(hidden, camera=K, layout="coco17"))
+
+
+def test_normalised_points_are_warned_of(lifter: Lifter) -> None:
+    with pytest.warns(UserWarning, match="look normalised to 0..1: multiply x by the image's width"):
+        lifter.lift(POINTS / (640, 480), layout="coco17")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lifter.lift(POINTS, layout="coco17")
+        lifter.lift(POINTS / 10, layout="coco17")  # a thermal image of 64x48 pixels
 
 
 def test_results_print_as_one_short_line(lifter):
