@@ -29,6 +29,7 @@ from msg_adapters.keypoints import (
 
 #: sensor_msgs/PointField datatype -> numpy type without byte order.
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_FLOATS = (7, 8)
 
 
 def read(msg: Any, points: int, source: Source) -> Keypoints2D:
@@ -42,7 +43,7 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     # Check sizes first: numpy cannot make a structured type with an absurd point_step.
     row_step = _row_step(msg)
     fields = {field.name: field for field in msg.fields}
-    confidence_name = next((name for name in CONFIDENCE_NAMES if name in fields), None)
+    confidence_name = next((name for name in CONFIDENCE_NAMES if _may_be_confidence(fields.get(name))), None)
     dtype = _point_type(msg, fields, confidence_name)
     cloud: np.ndarray = np.ndarray((msg.height, msg.width), dtype, buffer=msg.data, strides=(row_step, msg.point_step))
     cloud = _persons_first(cloud, points, source)
@@ -54,6 +55,13 @@ def read(msg: Any, points: int, source: Source) -> Keypoints2D:
     if len(msg.fields) == len(names):
         return keypoints
     return replace(keypoints, notes=(*keypoints.notes, _unused(msg, names)))
+
+
+def _may_be_confidence(field: Any) -> bool:
+    """Return whether a field has confidences. Under another name than the contract's, whole numbers have a meaning of
+    their own, such as the number of a class.
+    """
+    return field is not None and (field.name == "confidence" or (field.datatype in _FLOATS and field.count <= 1))
 
 
 def _unused(msg: Any, used: tuple[str, ...]) -> Note:

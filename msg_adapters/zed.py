@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_adapters.keypoints import Keypoints2D, MessageError, Source, by_name, no_persons, record
+from msg_adapters.keypoints import CONFIDENCE_SLACK, Keypoints2D, MessageError, Source, by_name, no_persons, record
 from msg_adapters.openpose import OPENPOSE18
 
 # fmt: off
@@ -82,6 +82,12 @@ def _placed(body: Any, names: tuple[str, ...]) -> np.ndarray:
             "tracking",
         )
     slots = body.skeleton_2d.keypoints[: len(order)]
+    if len(slots) < len(order):
+        raise MessageError(
+            "unknown_body_format",
+            f"a skeleton has {len(slots)} keypoints, body_format {body.body_format} needs {len(order)}; correct it in "
+            "the camera's body tracking",
+        )
     xy = np.array([slot.kp for slot in slots], dtype=np.float64)
     return by_name(np.column_stack([xy, _confidence(body, len(order))]), order, names)
 
@@ -97,4 +103,8 @@ def _format(body: Any) -> tuple[str | None, tuple[str, ...]]:
 
 def _confidence(body: Any, points: int) -> np.ndarray:
     percent = np.array(getattr(body, "skeleton_keypoint_confidence", ()), dtype=np.float64)[:points]
-    return np.nan_to_num(percent) / 100 if len(percent) == points and (percent > 0).any() else np.ones(points)
+    if len(percent) != points or not (percent > 0).any():
+        return np.ones(points)
+    # Nobody is seen with less than 1 % everywhere: these are shares.
+    unit = 100 if np.nanmax(percent) > 1 + CONFIDENCE_SLACK else 1
+    return np.nan_to_num(percent) / unit

@@ -412,6 +412,15 @@ def test_fields_that_are_not_used_are_named(make):
     assert "fields visibility of" in got.notes[0].text and "only x, y, score are" in got.notes[0].text
 
 
+@pytest.mark.parametrize("name, form, value", [("c", "u1", 0), ("score", "i4", 7), ("visibility", "u1", 2)])
+def test_whole_numbers_by_another_name_are_no_confidence(make, name, form, value):
+    """A class number of 0 must not hide every point, and no such field may cost the message."""
+    columns = {**xy_columns(some_points(1) * 9), name: np.full((1, P), value)}
+    got = read(CLOUD, cloud_of(make, columns, {name: form}), P)
+    assert got.visible.all() and (got.confidence == 1).all()
+    assert f"fields {name} of" in got.notes[0].text
+
+
 def test_normalised_keypoints_are_refused(make):
     xy = np.random.default_rng(0).uniform(-0.2, 1.3, (2, P, 2))
     messages = {

@@ -397,8 +397,16 @@ def test_zed_versions_with_fewer_slots(slots, body_format, own):
         assert_pose(read_of(make, foreign.FORMER_ZED, msg), COCO, own)
 
 
-@pytest.mark.parametrize("percent, expected", [(80.0, 0.8), (0.0, 1.0), (np.nan, 1.0)])
-def test_zed_confidences_are_percentages(percent, expected):
+def test_zed_skeletons_with_too_few_slots_are_refused():
+    make = foreign.LiveMake()
+    msg = foreign.zed(make, header_of(make), [POSE])
+    msg.objects[0].body_format, msg.objects[0].skeleton_2d.keypoints = 2, msg.objects[0].skeleton_2d.keypoints[:18]
+    with pytest.raises(MessageError, match="18 keypoints, body_format 2 needs 38"):
+        read_of(make, foreign.FORMER_ZED, msg)
+
+
+@pytest.mark.parametrize("percent, expected", [(80.0, 0.8), (0.0, 1.0), (np.nan, 1.0), (0.8, 0.8), (1.3, 1.0)])
+def test_zed_confidences_are_percentages_or_shares(percent, expected):
     make = foreign.LiveMake()
     msg = foreign.zed(make, header_of(make), [POSE])
     msg.objects[0].skeleton_keypoint_confidence = np.full(70, percent)
