@@ -405,7 +405,7 @@ def test_zed_skeletons_with_too_few_slots_are_refused():
         read_of(make, foreign.FORMER_ZED, msg)
 
 
-@pytest.mark.parametrize("percent, expected", [(80.0, 0.8), (0.0, 1.0), (np.nan, 1.0), (0.8, 0.8), (1.3, 1.0)])
+@pytest.mark.parametrize("percent, expected", [(80.0, 0.8), (0.0, 1.0), (np.nan, 1.0), (0.8, 0.8), (1.2, 1.0)])
 def test_zed_confidences_are_percentages_or_shares(percent, expected):
     make = foreign.LiveMake()
     msg = foreign.zed(make, header_of(make), [POSE])
