@@ -435,6 +435,30 @@ def test_pixels_against_metres_are_judged_with_the_camera_or_refused(model_file,
         assert "times as large as x and y of S" in capsys.readouterr().err
 
 
+def test_rays_are_judged_as_pixels_with_their_camera_are(model_file, tmp_path):
+    """Beside the axis, too: both are seen by cameras that are turned to the object."""
+    W, K, S = pinhole(turned(model_file))
+    pixels = evaluate(model_file, write(tmp_path / "p.npz", S, W=W, K=K), tmp_path)
+    rays = evaluate(model_file, write(tmp_path / "r.npz", S, W=S[:, :2] / S[:, 2:], calibrated=True), tmp_path)
+    for key in ("ne_flip_frame_percent", "n_mpjpe", "pa_mpjpe"):
+        key = key if key in rays and rays[key] is not None else f"{key}_units"
+        assert rays[key] == pytest.approx(pixels[key], rel=1e-4), key
+
+
+def test_the_camera_of_another_image_is_refused_as_such(model_file, tmp_path):
+    W, K, S = pinhole(turned(model_file))
+    with pytest.raises(DataError, match="with K, W .* is 0.4.* save the K of the image that W belongs to"):
+        load_sequence(write(tmp_path / "d.npz", S, W=W, K=K * [[2], [2], [1]]), turned=True)
+
+
+def test_true_points_in_the_centre_of_the_camera_are_unknown(model_file, tmp_path):
+    W, K, S = pinhole(turned(model_file))
+    marked = S.copy()
+    marked[1, :, 5] = 0
+    truth = load_sequence(write(tmp_path / "d.npz", marked, W=W, K=K), turned=True)
+    assert truth.present.sum() == S.shape[0] * S.shape[2] - 1 and not truth.present[1, 5]
+
+
 def test_other_frames_than_the_cameras_are_refused(model_file, tmp_path):
     S = turned(model_file)
     with pytest.raises(DataError, match="point in opposite directions"):

@@ -14,7 +14,8 @@ _DESCRIPTION = "Judge a model on frames it never saw, each lifted alone, or judg
 _EPILOG = """\
 DATA is an npz with
   W:        (F,2,P) image points, y down; S and W share one scale
-  S:        (F,3,P) the truth in the camera frame; NaN where it is unknown
+  S:        (F,3,P) the truth in the camera frame; NaN where it is unknown,
+            with K or calibrated also (0, 0, 0)
   visible:  (F,P) optional; the model sees visible points only, but errors
             cover all points
   K:        (3,3) optional; then W are pixels of this camera, and S is in its

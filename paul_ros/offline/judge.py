@@ -54,7 +54,7 @@ class Judge:
         self._frames_in_metres = self._frames_without_metres = 0
         self._certified = self._ambiguous = 0
         self._reprojection, self._sigma, self._in_sigmas = array("d"), array("d"), array("d")
-        self._sizes, self._truths = array("d"), 0
+        self._sizes, self._angles, self._truths = array("d"), array("d"), 0
 
     def add_frame(self, frame: LiftedFrame) -> None:
         """Take the next frame; it waits for its ground truth if that has not come."""
@@ -145,16 +145,20 @@ class Judge:
         self._truths += len(self._batch)
         for frame, truth in self._batch:
             self._sizes.extend(truth_units.size_ratios(frame.lifted, truth, metres))
+            self._angles.extend(truth_units.angles_between(frame.lifted, truth))
             self._in_sigmas.extend(_errors_in_sigmas(frame, truth, root).tolist())
         self._batch.clear()
 
     def _check_truth(self, done: Replay) -> None:
-        """Discard a ground truth that is not in metres, and the errors against it, which is a counted drop."""
+        """Discard a ground truth that is not in metres, and the errors against it; note one of another frame."""
         if problem := truth_units.problem(self._sizes):
             self._stream.ledger.drop("truth_not_metres", problem, self._truths)
             self._errors, self._rigid_errors, self._in_sigmas = TruthErrors(), TruthErrors(), array("d")
             self._sizes = array("d")
             done.truth.clear()
+        elif problem := truth_units.frame_problem(self._angles):
+            self._stream.ledger.note("truth_of_another_frame", problem, self._truths)
+        self._angles = array("d")
 
     def _units(self) -> str:
         if self._frames_in_metres and self._frames_without_metres:

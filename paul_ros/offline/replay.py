@@ -264,7 +264,8 @@ class _OfflineNode:
 
     def _take_truth(self, message: Any) -> None:
         flat = np.array([(p.position.x, p.position.y, p.position.z) for p in message.poses], float).reshape(-1, 3)
-        flat[~(np.abs(flat) < _MAX_COORDINATE).all(axis=1)] = np.nan
+        # A point in the camera's centre marks a missing one.
+        flat[~(np.abs(flat) < _MAX_COORDINATE).all(axis=1) | (flat == 0).all(axis=1)] = np.nan
         stamp = stamp_ns(message.header)
         if self._layout_known:
             self._pass_truth(stamp, flat)

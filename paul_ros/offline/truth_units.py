@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit of a ground truth, judged by its size: truth in millimetres or pixels must not pass for metres."""
+"""The unit of a ground truth, judged by its size, and its frame, judged by the direction in which it lies."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ _FACTOR = 8.0
 
 _LEAST_POINTS = 4
 """Fewest points with a ground truth by which a person's size is judged."""
+
+_SIDEWAYS = 20.0
+"""Degrees between lifted and true direction from which on the frames differ: pixels fix it to a degree."""
 
 _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres or pixels"))
 
@@ -45,6 +48,39 @@ def size_ratios(lifted: Lifted, truth: np.ndarray, metres_per_unit: float | None
         for points, true, seen, ok in zip(lifted.points, truth, known, lifted.ok)
         if ok and seen.sum() >= _LEAST_POINTS
     ]
+
+
+def frame_problem(angles: Sequence[float]) -> str:
+    """Return why the ground truth of a bag is not in the frame of its camera; '' if it may be.
+
+    Args:
+        angles: `angles_between` of all its persons.
+    """
+    angle = float(np.median(angles)) if len(angles) else 0.0
+    if angle < _SIDEWAYS:
+        return ""
+    return (
+        f"The ground truth lies {angle:.0f} degrees beside the persons that were lifted, so its frame is not that of "
+        "the camera: only PA-MPJPE has a meaning. Record it in the camera's optical frame (x right, y down, z "
+        "forward), or check that CameraInfo is that of the image."
+    )
+
+
+def angles_between(lifted: Lifted, truth: np.ndarray) -> list[float]:
+    """Return the degrees between the directions to persons lifted in metres and to their ground truth (N,P,3).
+
+    A ground truth about its own root has no direction, and so no angle.
+    """
+    if len(truth) != len(lifted.points) or lifted.units != "m":
+        return []
+    known = np.isfinite(truth).all(2)
+    found = []
+    for points, true, seen, ok in zip(lifted.points, truth, known, lifted.ok):
+        if ok and seen.sum() >= _LEAST_POINTS and np.linalg.norm(true[seen].mean(0)) > _extent(true[seen]) > 0:
+            one, other = points[seen].mean(0), true[seen].mean(0)
+            cosine = one @ other / (np.linalg.norm(one) * np.linalg.norm(other))
+            found.append(float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))))
+    return found
 
 
 def _size_ratio(true: np.ndarray, points: np.ndarray, unit: float | None) -> float:

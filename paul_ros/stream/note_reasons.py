@@ -180,4 +180,11 @@ NOTE_REASONS = (
         "Check that both use the same clock and that `depth` has at least the rate of the keypoints.",
         warn_above=MOST,
     ),
+    Reason(
+        "truth_of_another_frame",
+        NOTE,
+        "The ground truth lies in another direction than the persons that were lifted, so only PA-MPJPE has a meaning",
+        "Record the ground truth in the camera's optical frame (x right, y down, z forward), or check that CameraInfo "
+        "is that of the image.",
+    ),
 )

@@ -22,6 +22,9 @@ _SCALES = (0.8, 1.25)
 _LEAST_LIKENESS = 0.5
 """Least correlation of W and S seen from the front, if S is in the camera frame."""
 
+_RAYS = Intrinsics(1, 1, 0, 0, 0, 0)
+"""The camera whose pixels are rays."""
+
 _LEAST_POINTS = 4
 """Points of a frame by which W and S are compared."""
 
@@ -154,11 +157,12 @@ def _sequence(
     visible &= ~placeholders(W[:, 0], W[:, 1], visible)
     if not np.isfinite(S).any():
         raise DataError(f"the truth S in '{path}' holds no number")
-    if K is not None:
-        W, S = _rays(W, S, visible, _camera(K, path), turned)
-    if K is not None or _is_true(calibrated):
+    camera = _camera(K, path) if K is not None else _RAYS if _is_true(calibrated) else None
+    if camera is not None:
+        S = np.where((S == 0).all(1, keepdims=True), np.nan, S)  # in the camera's centre: marks a missing point
+        W, S = _rays(W, S, visible, camera, turned)
         W = W * _mean_depth(S, path)[:, None, None]
-    _check_units(W, S, visible & np.isfinite(S).all(1), path)
+    _check_units(W, S, visible & np.isfinite(S).all(1), path, K is not None)
     edges = np.zeros((0, 2), int) if edges is None else edges
     if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu" or not _within(edges, points):
         raise DataError(f"edges in '{path}' must be (E,2) indices of the {points} points")
@@ -202,7 +206,7 @@ def _mean_depth(S: np.ndarray, path: Path) -> np.ndarray:
     return np.where(known.any(1), depth, 1.0)
 
 
-def _check_units(W: np.ndarray, S: np.ndarray, known: np.ndarray, path: Path) -> None:
+def _check_units(W: np.ndarray, S: np.ndarray, known: np.ndarray, path: Path, has_camera: bool) -> None:
     """Refuse points W (F,2,P) that are no view of S (F,3,P) in its units, by the points known in both (F,P)."""
     seen, front = (_about_mean(points, known) for points in (W, S[:, :2]))
     size, true_size = (np.sqrt((points**2).sum((1, 2))) for points in (seen, front))
@@ -220,11 +224,17 @@ def _check_units(W: np.ndarray, S: np.ndarray, known: np.ndarray, path: Path) ->
             "forward)"
         )
     low, high = _SCALES
-    if not low <= scale <= high:
+    if low <= scale <= high:
+        return
+    if has_camera:
         raise DataError(
-            f"W in '{path}' is {scale:.3g} times as large as x and y of S: they have different units, such as "
-            "pixels and metres. Save the camera matrix as K (3,3), or bring W and S to one unit"
+            f"with K, W in '{path}' is {scale:.3g} times as large as its truth S is seen: save the K of the image that "
+            "W belongs to, and W in pixels"
         )
+    raise DataError(
+        f"W in '{path}' is {scale:.3g} times as large as x and y of S: they have different units, such as "
+        "pixels and metres. Save the camera matrix as K (3,3), or bring W and S to one unit"
+    )
 
 
 def _about_mean(points: np.ndarray, known: np.ndarray) -> np.ndarray:
