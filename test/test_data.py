@@ -317,6 +317,13 @@ def test_normalised_arrays_are_noted(tmp_path):
         assert not any("normalised" in note for note in load(tmp_path, **arrays).notes)
 
 
+def test_confidences_in_arrays_are_named_as_unused(tmp_path):
+    for name in ("confidence", "score", "visibility"):
+        data = load(tmp_path, W=views(), **{name: np.ones((len(views()), views().shape[2]))})
+        assert any(note.startswith(f"{name} not used: save visible") for note in data.notes)
+        assert data.sha256 == load(tmp_path, W=views()).sha256
+
+
 def test_a_bag_of_lists_is_not_divided_by_guess(tmp_path):
     bag = write(tmp_path / "in.mcap", "pose_array", with_camera=False)
     with pytest.raises(DataError, match="34 keypoints in one list may be one body or several.*--layout"):

@@ -105,7 +105,7 @@ def test_errors_have_their_closed_form(model_file, tmp_path):
 
 
 def test_distances_of_metric_truth_are_in_millimetres(model_file, tmp_path):
-    S = turned(model_file)
+    S = turned(model_file, size=0.33)
     truth = S.copy()
     truth[:, 2] *= 1.1
     units = evaluate(model_file, write(tmp_path / "d.npz", truth, W=S[:, :2]), tmp_path)
@@ -457,6 +457,15 @@ def test_true_points_in_the_centre_of_the_camera_are_unknown(model_file, tmp_pat
     marked[1, :, 5] = 0
     truth = load_sequence(write(tmp_path / "d.npz", marked, W=W, K=K), turned=True)
     assert truth.present.sum() == S.shape[0] * S.shape[2] - 1 and not truth.present[1, 5]
+
+
+def test_metres_that_are_millimetres_are_refused(tmp_path, capsys):
+    human = load_model("human")
+    S = human.metres_per_unit * random_rotations(12, 0) @ human.mean_shape.astype(float)
+    assert evaluate("human", write(tmp_path / "m.npz", S, metres=True), tmp_path)["n_mpjpe_mm"] < 100
+    assert cli.main(["evaluate", "human", str(write(tmp_path / "mm.npz", 1000 * S, metres=True))]) == 1
+    assert "looks like millimetres" in capsys.readouterr().err
+    evaluate("human", write(tmp_path / "units.npz", 1000 * S), tmp_path)
 
 
 def test_other_frames_than_the_cameras_are_refused(model_file, tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from msg_adapters.keypoints import CONFIDENCE_NAMES
 from paul_ros.errors import LayoutError, NpzError
 from paul_ros.files import read_npz
 from paul_ros.layout import Layout, anonymous_layout, load_layout
@@ -21,7 +22,7 @@ def read_arrays(path: Path, layout: Layout | None) -> RawFrames:
     Raises:
         DataError: arrays that cannot be read or do not fit together.
     """
-    optional = ("visible", "calibrated", "detected", *([] if layout else ["edges"]))
+    optional = ("visible", "calibrated", "detected", *CONFIDENCE_NAMES, *([] if layout else ["edges"]))
     try:
         arrays = read_npz(path, ("W",), optional)
     except NpzError as error:
@@ -34,6 +35,8 @@ def read_arrays(path: Path, layout: Layout | None) -> RawFrames:
     missing = placeholders(W[:, 0], W[:, 1], given)
     visible = given & ~missing
     notes = [f"{missing.sum()} of {given.sum()} points at (0, 0) or (-1, -1) taken as missing"] if missing.any() else []
+    if unused := [name for name in CONFIDENCE_NAMES if name in arrays]:
+        notes.append(f"{', '.join(unused)} not used: save visible = confidence > 0.3, or unsure points count as seen")
     if not calibrated and look_normalised(W[:, 0], W[:, 1], visible):
         notes.append(
             "the coordinates look normalised to 0..1: multiply x by the image's width and y by its height, "

@@ -22,17 +22,17 @@ _UNITS = ((1000.0, "millimetres"), (100.0, "centimetres or pixels"))
 
 
 def problem(ratios: Sequence[float]) -> str:
-    """Return why the ground truth of a bag is not in metres; '' if it may be.
+    """Return why a ground truth is not in metres; '' if it may be.
 
     Args:
-        ratios: `size_ratios` of all its persons.
+        ratios: sizes of its persons over those of the model, such as `size_ratios`.
     """
     ratio = float(np.median(ratios)) if len(ratios) else 1.0
     if not 0 < ratio or 1 / _FACTOR <= ratio <= _FACTOR:
         return ""
     guess = next((f" It looks like {name}." for size, name in _UNITS if size / 3 < ratio < 3 * size), "")
     return (
-        f"The ground truth is {ratio:.3g} times as large as the persons that were lifted.{guess} Record it in metres, "
+        f"The ground truth is {ratio:.3g} times as large as the persons of the model.{guess} Record it in metres, "
         "in the frame of the camera."
     )
 

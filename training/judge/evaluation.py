@@ -18,6 +18,7 @@ from paul_ros.files import read_npz
 from paul_ros.lifted import AMBIGUOUS, TOO_FEW_POINTS
 from paul_ros.model import Model
 from paul_ros.model_file import load_model
+from paul_ros.offline import truth_units
 from paul_ros.offline.tables import Row, render
 from paul_ros.versions import versions
 from training.errors import DataError
@@ -52,6 +53,7 @@ def evaluate_model(
             f"'{data}' has {truth.W.shape[2]} points, model '{model_name}' has {len(model.layout.names)}: "
             "evaluate it with data of its own layout"
         )
+    _check_metres(truth, model, data)
     found = predict(model, truth.W, truth.visible, count)
     rigid = predict(model.rigid(), truth.W, truth.visible)
     compared = Comparison.of(truth, found, rigid, flip=not model.header["chirality"]["known"])
@@ -59,6 +61,16 @@ def evaluate_model(
     observed = replace(found, S=with_observed(found.S, truth))
     report = _report(compared, observed=errors(compared, observed), **about)
     return report | _single_times(model, truth), compared
+
+
+def _check_metres(truth: Sequence, model: Model, data: str | Path) -> None:
+    """Refuse a truth that is said to be in metres, and is far from the size that the model has in metres."""
+    if not (truth.metres and model.metres_per_unit):
+        return
+    size = model.metres_per_unit * float(np.ptp(model.mean_shape, axis=1).max())
+    S = truth.S[truth.present.all(1)]
+    if problem := truth_units.problem((np.ptp(S, axis=2).max(1) / size).tolist()):
+        raise DataError(f"'{data}' says that S is in metres. {problem}")
 
 
 def _load_model(name: str | Path) -> Model:
