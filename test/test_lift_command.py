@@ -655,3 +655,9 @@ def test_confidences_of_another_number_are_refused(persons, tmp_path, capsys):
     (tmp_path / "in.json").write_text(json.dumps([[person]]))
     assert lift(tmp_path / "in.json", tmp_path / "out.npz", "human") == 1
     assert "frame 0, person 0: keypoint_scores has 2 numbers for 17 keypoints" in capsys.readouterr().err
+
+
+def test_an_error_names_the_column_of_the_confidences(tmp_path, capsys):
+    (tmp_path / "in.csv").write_text("frame,keypoint,x,y,score\n0,nose,320,100,high\n")
+    assert lift(tmp_path / "in.csv", tmp_path / "out.npz", "human") == 1
+    assert "line 2: score is 'high'" in capsys.readouterr().err

@@ -105,7 +105,7 @@ def _rows(lines: Any, place: dict[str, int], confidence_name: str, width: int) -
                 cells[place["keypoint"]].strip(),
                 _coordinate(cells[place["x"]], "x", line),
                 _coordinate(cells[place["y"]], "y", line),
-                _coordinate(cells[confidence], "confidence", line) if confidence is not None else 1.0,
+                _coordinate(cells[confidence], confidence_name, line) if confidence is not None else 1.0,
             )
 
 
