@@ -23,6 +23,7 @@ from paul_ros.offline.bag_records import BagMessages
 from paul_ros.offline.bag_writer import BagWriter
 from paul_ros.offline.canvas import AMBER, turntable
 from paul_ros.offline.film_files import write_film
+from paul_ros.offline.replay import replay
 from paul_ros.offline.shipped_bags import find_bag
 from paul_ros.stream.stream import open_stream
 
@@ -123,6 +124,16 @@ def test_frames_without_metres_are_not_drawn_among_metres(tmp_path, model_file, 
     assert capsys.readouterr().out.endswith(", 10 frames without metres left out\n")
 
 
+def test_a_camera_after_the_last_frame_makes_no_metres(tmp_path, model_file):
+    """Persons in model units have no place in a room."""
+    bag = make_bag(tmp_path / "x.mcap", 10, camera=False)
+    stream = open_stream(model_file)
+    done = replay(bag, stream)
+    stream.camera_info(camera_info(MAKE))
+    assert done.stream.units == "m" and {frame.lifted.units for frame in done.frames} == {"model"}
+    assert film_stage.Stage.of(done, "x", 0.0).room is None
+
+
 def test_no_keypoints_at_all(tmp_path, model_file, capsys):
     bag = make_bag(tmp_path / "short.mcap", 3)
     assert cli.main(["view", str(bag), "--topic", "/others", "-o", str(tmp_path / "f.gif")]) == 1
@@ -191,8 +202,6 @@ def test_without_a_camera_and_nobody_at_first(tmp_path, drawn):
 
 def test_the_turntable_shows_whole_persons_and_the_ground(tmp_path, model_file):
     """Of one that moves fast as well; and all pictures have squares of one size."""
-    from paul_ros.offline.replay import replay
-
     height = [0, 0, -1.5, -0.5, 0, 0, 3, 0, 0, 0]
     bag = make_bag(tmp_path / "jump.mcap", 10, rate=10, persons=lambda index: persons_at((0.3, height[index], 6)))
     stage = film_stage.Stage.of(replay(bag, open_stream(str(model_file))), "jump", 0.0)

@@ -63,7 +63,8 @@ class Stage:
         around = [points - centre for points, centre in zip(bodies, centres)]
         # Frames without persons may have the points of another layout: the bag's layout shows with the first person.
         everywhere, centred = (np.concatenate([body.reshape(-1, 3) for body in which]) for which in (bodies, around))
-        metric = done.stream.units == "m"
+        # The stream's units are those after the last frame.
+        metric = all(frame.lifted.units == "m" for frame in done.frames if frame.lifted.ok.any())
         floor = np.percentile((everywhere if metric else centred)[:, 1], 98)
         depths = floor - (centres[:, 1] if metric else np.zeros(len(centres)))
         reach = [
