@@ -107,7 +107,7 @@ def _outward(model: Layout, given: Layout, output: Layout | None) -> Mapping:
         return model.map_to(model if lacking else given)
     if lacking:
         raise LayoutError(
-            f"output_layout '{output.name}': the model's layout '{model.name}' has no {', '.join(lacking)}; "
+            f"`output_layout` '{output.name}': the model's layout '{model.name}' has no {', '.join(lacking)}; "
             f"choose one whose points it has, or '{MODEL}' for all points of the model"
         )
     return model.map_to(output)

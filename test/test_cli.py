@@ -239,7 +239,7 @@ def test_half_a_bag(model_file, tmp_path):
         (["replay", ONE, "--person-height", "9"], "--person-height is 9.0; it must be 0 or 0.3 to 3.0"),
         (["replay", ONE, "--person-height", "1e-9"], "--person-height is 1e-09; it must be 0 or 0.3 to 3.0"),
         (["replay", ONE, "--smoothing", "nan"], "smoothing is nan"),
-        (["replay", ONE, "--output-layout", "body25"], "has no left_big_toe"),
+        (["replay", ONE, "--output-layout", "body25"], "--output-layout 'body25': the model's layout"),
         (["replay", ONE, "--layout", "coco71"], "did you mean 'coco17'?"),
         (["replay", ONE, "--topic", "/skeletons"], "no messages on /skeletons"),
         (["replay", ONE, "--topic", "/camera_info"], "/camera_info is a sensor_msgs/msg/CameraInfo, not readable"),
@@ -249,7 +249,8 @@ def test_half_a_bag(model_file, tmp_path):
         (["inspect", "hunam"], "did you mean model 'human'?"),
         (["inspect", "nowhere.npz"], "no model 'nowhere.npz'"),
         (["inspect", "nowhere.mcap"], "no such file or folder"),
-        (["replay", ONE, "-o", "x.bag"], "x.bag: this suffix says no format; name a file that ends in .mcap"),
+        (["replay", ONE, "-o", "x.bag"], "x.bag: the suffix is no format of this output; name a file that ends in .mcap"),
+        (["replay", "OUT/array.npz"], "`paul lift` reads arrays of keypoints"),
         (["replay", ONE, "-o", "-"], "this cannot go to standard output; name a file that ends in .mcap"),
         (["replay", ONE, "--plot", "x.txt"], "name a file that ends in .png or .svg or .pdf"),
         (["replay", ONE, "--plot", "-"], "this cannot go to standard output; name a file that ends in .png"),
@@ -261,6 +262,7 @@ def test_half_a_bag(model_file, tmp_path):
 )
 def test_error_is_one_line(arguments, clue, model_file, tmp_path, capsys):
     arguments = [str(a).replace("OUT", str(tmp_path)) for a in arguments]
+    (tmp_path / "array.npz").write_bytes(b"PK")
     if arguments[0] == "replay" and "--model" not in arguments:
         arguments += ["--model", str(model_file)]
     assert cli.main(arguments) == 1

@@ -332,13 +332,21 @@ def test_the_image_of_the_keypoints_is_stated(persons, model_file, tmp_path, cap
     for image in ("auto", "rectified", "raw"):
         output = tmp_path / f"{image}.npz"
         assert lift(source, output, model_file, "--camera", calibration, "--image", image) == 0
-        assert ("Set `image`" in capsys.readouterr().out) == (image == "auto")
+        assert ("Set --image to raw" in capsys.readouterr().out) == (image == "auto")
         results[image] = read(output)["points"]
     np.testing.assert_array_equal(results["auto"], results["rectified"])
     camera = read_camera_info(info(d=[-0.2, 0, 0, 0, 0]))
     truth = Lifter(model_file).lift(persons[..., :2], camera=camera, layout="coco17")
     np.testing.assert_allclose(results["raw"], truth.points, atol=1e-5)
     assert np.abs(results["raw"] - results["rectified"]).max() > 0.02
+
+
+@pytest.mark.parametrize("camera", [[], ["--intrinsics", "500", "500", "320", "240"]])
+def test_a_raw_image_without_a_distortion_is_wrong_usage(persons, model_file, tmp_path, capsys, camera):
+    source = npz(tmp_path / "in.npz", keypoints=persons)
+    with pytest.raises(SystemExit, match="2"):
+        lift(source, tmp_path / "out.npz", model_file, *camera, "--image", "raw")
+    assert "--image raw needs --camera" in capsys.readouterr().err
 
 
 def test_keypoints_outside_the_image_of_the_camera_file_are_noted(persons, model_file, tmp_path, capsys):

@@ -304,12 +304,12 @@ def test_messages_outside_chunks_are_read_on_too(tmp_path):
 # --- several recordings
 
 
-def test_several_recordings_are_refused_with_the_commands(tmp_path):
+def test_several_recordings_are_refused_with_their_paths(tmp_path):
     write(tmp_path / "one person.mcap", [word(1)])
     write(tmp_path / "two.mcap", [word(1)])
     for read in (read_records, topics_of, inspect):
         with pytest.raises(
-            BagError, match="holds 2 recordings.*`paul replay '.*one person.mcap'` or .*`paul train` takes"
+            BagError, match="holds 2 recordings.*Give one of them: `'.*one person.mcap'` or `.*`paul train` takes"
         ):
             list(read(tmp_path if read is not inspect else str(tmp_path)))
 
@@ -368,7 +368,7 @@ def test_a_folder_of_recordings_is_refused(tmp_path):
     splits(tmp_path / "monday", 2)
     (tmp_path / "tuesday").mkdir()
     (tmp_path / "tuesday/metadata.yaml").touch()
-    with pytest.raises(BagError, match=f"holds 2 recordings.*paul replay {tmp_path}/monday` or `paul replay"):
+    with pytest.raises(BagError, match=f"holds 2 recordings.*`{tmp_path}/monday` or `{tmp_path}/tue"):
         Recording(tmp_path)
 
 

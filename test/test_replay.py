@@ -385,6 +385,7 @@ def test_bad_messages_are_counted_and_the_rest_is_lifted(short, model_file, tmp_
             writer.write(topic, message, time)
     report = evaluate(replay(tmp_path / "x.mcap", open_stream(model_file)))
     assert report["dropped"]["wrong_fields"] + report["frames"] == 90
+    assert f"\n  dropped: 6 wrong_fields: {report['advice']['wrong_fields']}\n" in table(report)
     assert report["dropped"]["wrong_fields"] == 6  # every tenth frame but for the three first, which hold no person
 
 

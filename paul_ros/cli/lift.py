@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from paul_ros.cli.advice import in_options
 from paul_ros.cli.options import (
     Commands,
     HelpFormatter,
@@ -123,6 +124,8 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         PaulError: a file or a parameter cannot be used, or nobody could be lifted.
     """
+    if args.image == "raw" and not args.camera:
+        args.usage_error("--image raw needs --camera, whose distortion is corrected; --intrinsics have none")
     kinds = [_kind(args, path, name) for path, name in ((args.input, "IN"), (args.output, "OUT"))]
     from paul_ros.errors import KeypointFileError
     from paul_ros.lifter import Lifter
@@ -165,7 +168,7 @@ def _lift(args: argparse.Namespace, kinds: list[str], lifter: Lifter, min_confid
         lifted = lift_persons(keypoints.batches, lifter, route, session, min_confidence)
         with open_output(args.output) as out, progress("lift", "person", keypoints.persons) as count:
             LiftedFile(route.output, model, units, axes).write(out, kinds[1], _counted(lifted, tally, count))
-    return "\n".join([_summary(args, tally, route.output.name, units), *_notes(tally, session, route.given.name)])
+    return "\n".join([_summary(args, tally, route.output.name, units), *_notes(args, tally, session, route.given.name)])
 
 
 class _Tally:
@@ -211,11 +214,11 @@ def _reasons(tally: _Tally) -> str:
     return ", ".join(f"{number} {reason}" for reason, number in left_out)
 
 
-def _notes(tally: _Tally, session: Session, layout: str) -> list[str]:
+def _notes(args: argparse.Namespace, tally: _Tally, session: Session, layout: str) -> list[str]:
     notes = [f"note: {text} ({number} points)" for text, number in tally.notes.values()]
     if session.intrinsics is None:
         notes.append("note: no camera, so lengths are in model units; give --camera or --intrinsics for metres")
-    notes += [f"note: {advice}" for advice in session.ledger.advice.values()]
+    notes += [f"note: {in_options(advice, vars(args))}" for advice in session.ledger.advice.values()]
     if tally.unlike:
         notes.append(
             f"note: no shape of the model fits {tally.unlike} of the persons well; if the keypoints are not in the "

@@ -21,6 +21,7 @@ from paul_ros.wording import quantity
 
 _ZSTD_MAGIC, _ROS1_MAGIC = b"\x28\xb5\x2f\xfd", b"#ROSBAG V"
 _HEAD_BYTES = 16
+_ARRAYS = (".npz", ".csv", ".json")  # suffixes of what `paul lift` reads
 _NAMED_PROBLEMS = 3  # most kinds of damage that a text names
 
 
@@ -93,7 +94,7 @@ class BagFile:
         elif self.packed and (self._pack_damage or not head):
             self.refusal = f"the compressed file is damaged ({self._pack_damage or 'it ends too early'})"
         else:
-            self.refusal = f"not an mcap or sqlite3 file; {conversion(self.path)}"
+            self.refusal = f"not an mcap or sqlite3 file; {_other_reader(self.path)}"
 
     @property
     def storage(self) -> str | None:
@@ -202,10 +203,12 @@ def starts_as_recording(path: Path) -> bool:
         return False
 
 
-def conversion(path: Path) -> str:
-    """Return the commands that turn a bag of another storage or compression into mcap."""
+def _other_reader(path: Path) -> str:
+    """Return what to do with a file that is no recording, or one of another storage."""
+    if path.suffix in _ARRAYS:
+        return "`paul lift` reads arrays of keypoints"
     return (
-        f"convert it where it was recorded: `ros2 bag convert -i {path} -o out.yaml`, where out.yaml holds "
+        f"if it is a recording of another storage, convert it where it was recorded: `ros2 bag convert -i {path} -o out.yaml`, where out.yaml holds "
         f"`output_bags: [{{uri: {path.stem}_mcap, storage_id: mcap, all: true}}]`"
     )
 

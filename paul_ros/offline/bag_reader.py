@@ -225,11 +225,11 @@ def _not_one(folder: Path, files: list[Path], missing: list[Path], gap: str) -> 
         if ros1:
             return f"{folder}: {BagFile(ros1[0]).refusal}"
         return f"{folder}: no recording in this folder (no {', no '.join(SUFFIXES)} file)"
-    commands = [f"`paul replay {_quoted(file)}`" for file in files[:_NAMED_FILES]]
+    named = " or ".join(f"`{_quoted(file)}`" for file in files[:_NAMED_FILES])
     if len(files) == 1:
-        return f"{folder}: the recording lies in a folder of its own: give that, as in {commands[0]}"
+        return f"{folder}: the recording lies in a folder of its own: give that, {named}"
     more = f" and {len(files) - _NAMED_FILES} more" if len(files) > _NAMED_FILES else ""
-    one_by_one = f"ive them one by one, as in {' or '.join(commands)}{more}; `paul train` takes several at once"
+    one_by_one = f"ive them one by one: {named}{more}; `paul train` takes several at once"
     if not gap:
         return f"{folder}: holds {quantity(len(files), 'recording')}, not the files of one. G{one_by_one}"
     storage = "sqlite3" if ".db3" in files[0].name else "mcap"

@@ -44,8 +44,8 @@ class Role:
         """Raise WrongTopicError if a topic's type cannot be read in this role."""
         if type_name not in self.types:
             raise WrongTopicError(
-                f"{topic} is a {type_name}, not readable as {self.name} ({' or '.join(self.types)} is): "
-                f"choose another with {self.option}"
+                f"{topic} is a {type_name}, not readable as {self.name}: choose another topic with {self.option}, "
+                f"of type {' or '.join(self.types)}"
             )
 
 

@@ -62,7 +62,7 @@ def view_bag(
         progress: shows progress over the pictures.
 
     Returns:
-        The film, and the error of a damaged bag, which is drawn up to the damage.
+        The film, and the error of a damaged bag, all of whose whole messages are drawn.
 
     Raises:
         BagError: no keypoints can be read in that part; says up to when the bag has some.

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from paul_ros.offline.tables import Cell, Row, cell, figure, render
+from paul_ros.stream.reason import DROP, PERSON
+from paul_ros.stream.reasons import reason_of
 from paul_ros.wording import quantity
 
 _ERROR_ROWS = (
@@ -41,8 +43,7 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
         lines.append(
             f"  {without} without metres, before the first usable CameraInfo: left out of NE, root and distance errors"
         )
-    advice = report["advice"]
-    lines += [f"  noted: {count} {what}: {advice[what]}" for what, count in report["noted"].items() if what in advice]
+    lines += _advice(report)
     lines.append("")
     lifted, rigid = "", ""
     rows: list[Row] = []
@@ -60,6 +61,18 @@ def table(report: dict, further: Sequence[Row] = ()) -> str:
 def _camera(report: dict) -> str:
     topic, image = report["camera_info_topic"] or "none in the bag", report["image"]
     return f"{topic} ({image} image; its distortion: {report['distortion']})" if image else topic
+
+
+def _advice(report: dict) -> list[str]:
+    """Return a line for each drop of messages and each note with advice. A few persons left out are normal."""
+    advice = report["advice"]
+    messages = {what: count for what, count in report["dropped"].items() if reason_of(what, DROP).kind != PERSON}
+    return [
+        f"  {done}: {count} {what}: {advice[what]}"
+        for done, counts in (("dropped", messages), ("noted", report["noted"]))
+        for what, count in counts.items()
+        if what in advice
+    ]
 
 
 def _errors(report: dict, name: str, key: str) -> tuple[Cell, Cell]:
