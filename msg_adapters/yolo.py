@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""yolo_msgs/DetectionArray (yolo_ros; once yolov8_msgs): pixels, ids if tracking is on.
+"""yolo_msgs/DetectionArray (yolo_ros; formerly yolov8_msgs): pixels, ids if tracking is on.
 
 A detection's keypoint list is sparse and its ids count from 1. Points are placed by id, never by position in the list.
 A point at exactly (0, 0) or (-1, -1) is missing.

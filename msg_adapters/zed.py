@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""zed_msgs/ObjectsStamped (ZED cameras; once zed_interfaces): pixels, ids if tracking is on; placed by name.
+"""zed_msgs/ObjectsStamped (ZED cameras; formerly zed_interfaces): pixels, ids if tracking is on; placed by name.
 
 A skeleton has 70 slots for every body_format; only the first 18, 34 or 38 are filled, and the others are zero. Versions
 before 4.0 have 18 or 34 slots. NaN, negative and (0, 0) mean missing. Objects without a skeleton are ignored. Some

@@ -126,7 +126,7 @@ def _replacement(path: str | os.PathLike, buffering: int) -> Iterator[BinaryIO]:
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
             # "x": the name is of this process alone.
             file = open(part, "xb", buffering)
-        # A full disk names no file.
+        # The error of a full disk names no file.
         with _naming(path, None, str(part)):
             with file:
                 yield file

@@ -20,10 +20,10 @@ from paul_ros.layout import Layout, layout_names, load_layout
 from paul_ros.placeholders import look_normalised, placeholders
 
 _FOCAL_LENGTHS = (10.0, 1e6)
-"""Pixels, limits of plausible focal lengths; a normalised K is below them."""
+"""Lowest and highest plausible focal length in pixels. A normalised K is below them."""
 
 HEIGHTS = (0.3, 3.0)
-"""Metres, limits of the heights of persons, as of the parameter person_height; centimetres are above them."""
+"""Lowest and highest height of a person in metres, as for the parameter person_height. Centimetres are above them."""
 _LIMITS = "{:g} to {:g}".format(*_FOCAL_LENGTHS)
 
 

@@ -198,7 +198,7 @@ def _bag_keypoints(
         topic: that is read, with * for any part of a name; None reads all.
         image_size: width and height in pixels, if known.
         rejections: is given the last reason for which messages of a topic were rejected.
-        refused: is given the number of rejected messages by topic and reason, and the last text.
+        refused: receives the number of rejected messages and the text of the last, by topic and reason.
         guessed: see ``read_bag``.
     """
     from paul_ros.offline.bag_reader import matches

@@ -65,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _print_any_text() -> None:
-    """Let the terminal's encoding, such as ASCII, not stop a command: characters that it lacks are escaped."""
+    """Escape characters that the terminal's encoding, such as ASCII, lacks; printing them would be an error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -43,7 +43,9 @@ def check_suffix(path: Path | None, suffixes: Collection[str]) -> None:
     from paul_ros.files import is_stream
 
     if path and path.suffix not in suffixes and (path == STDOUT or not is_stream(path)):
-        what = "this cannot go to standard output" if path == STDOUT else f"{path}: the suffix is no format of this output"
+        what = (
+            "this cannot go to standard output" if path == STDOUT else f"{path}: the suffix is no format of this output"
+        )
         raise OutputError(f"{what}; name a file that ends in {' or '.join(suffixes)}")
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,8 +20,11 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse all arguments; exit with code 2 if one is unknown."""
-        parsed, unknown = super().parse_known_args(args, namespace)
+        """Parse all arguments; exit with code 2 if one is unknown or empty. An empty path would be this folder."""
+        words = sys.argv[1:] if args is None else list(args)
+        parsed, unknown = super().parse_known_args(words, namespace)
+        if "" in words:
+            self.error("an argument is empty, as from a variable that is not set: give a value, or leave it out")
         if unknown:
             option = unknown[0].partition("=")[0]
             hint = did_you_mean(option, self._option_string_actions) if option.startswith("-") else ""
