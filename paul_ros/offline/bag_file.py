@@ -208,7 +208,8 @@ def _other_reader(path: Path) -> str:
     if path.suffix in _ARRAYS:
         return "`paul lift` reads arrays of keypoints"
     return (
-        f"if it is a recording of another storage, convert it where it was recorded: `ros2 bag convert -i {path} -o out.yaml`, where out.yaml holds "
+        "if it is a recording of another storage, convert it where it was recorded: "
+        f"`ros2 bag convert -i {path} -o out.yaml`, where out.yaml holds "
         f"`output_bags: [{{uri: {path.stem}_mcap, storage_id: mcap, all: true}}]`"
     )
 
