@@ -33,7 +33,7 @@ def is_bag(path: Path) -> bool:
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """Return the recordings' files of a folder, sorted by name. A file still being written comes only if it is alone."""
+    """Return the recordings' files of a folder, sorted by name; a file still being written only if it is alone."""
     files = sorted(
         file
         for file in folder.iterdir()
