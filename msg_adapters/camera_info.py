@@ -37,11 +37,13 @@ def read_camera_info(msg: Any, image: str = "auto") -> Intrinsics:
 
     The rule of 'auto', in this order:
 
-    - D is zero or empty: both images are equal. P is used if it is filled. For equidistant, whose formula with zeros is
-      no pinhole camera, this is noted as `image_assumed`.
+    - D is zero or empty, and the model is not equidistant: both images are equal. P is used if it is filled.
     - P is not filled: raw.
     - P equals K: raw, since no rectification leaves K as it is; the driver copied it.
     - Otherwise: rectified, noted as `image_assumed`.
+
+    An equidistant lens bends the image also if its D is zero. An image that is taken as raw for it is noted as
+    `image_assumed` too, since drivers may publish rectified images that way.
 
     Args:
         msg: the message, of rclpy or rosbags.
@@ -57,15 +59,16 @@ def read_camera_info(msg: Any, image: str = "auto") -> Intrinsics:
     window = _window(msg)
     p, k = ([float(matrix[index]) for index in at] for matrix, at in ((msg.p, (0, 5, 2, 6)), (msg.k, (0, 4, 2, 5))))
     filled = p[0] > 0 and p[1] > 0 and all(map(math.isfinite, p))
-    distorted = bool(np.any(msg.d))
+    has_numbers = bool(np.any(msg.d))
+    distorted = has_numbers or str(msg.distortion_model) == EQUIDISTANT
     taken = image if image != "auto" else _likely_image(p, k, filled, distorted)
     matrix, (fx, fy, cx, cy) = ("P", p) if taken == "rectified" and filled else ("K", k)
     _check(matrix, fx, fy, cx, cy, max(int(msg.width), int(msg.height)))
     notes = []
     if image == "auto" and taken == "rectified" and distorted:
         notes.append(Note("image_assumed", _ASSUMED))
-    if image != "rectified" and not distorted and len(msg.d) and str(msg.distortion_model) == EQUIDISTANT:
-        notes.append(Note("image_assumed", _NO_FISHEYE))
+    if image == "auto" and taken == "raw" and distorted and not has_numbers:
+        notes.append(Note("image_assumed", _IDEAL_FISHEYE))
     if image == "rectified" and not filled and distorted:
         notes.append(Note("rectified_without_p", _WITHOUT_P))
     distortion, uncorrected = _distortion(msg) if taken == "raw" else (None, "")
@@ -100,9 +103,9 @@ _ASSUMED = (
     "CameraInfo has distortion, and its P differs from K, so the keypoints are taken as those of the rectified image. "
     "Set `image` to raw if the detector sees the raw image, or to rectified to confirm."
 )
-_NO_FISHEYE = (
-    "CameraInfo names the model equidistant, and its D is zero, so the image is taken to have no distortion, as "
-    "image_geometry does. Publish the lens's coefficients if the image is a fisheye's."
+_IDEAL_FISHEYE = (
+    "CameraInfo names the model equidistant, and its D is zero, so the keypoints are taken as those of an ideal "
+    "fisheye's raw image. Set `image` to rectified if the detector sees a rectified image, or to raw to confirm."
 )
 _WITHOUT_P = (
     "`image` is rectified, but P of CameraInfo is not filled, so K is used. Let the camera's driver fill P, or set "

@@ -83,14 +83,17 @@ def read_distortion(model: str, coefficients: Sequence[float]) -> Distortion | N
     An empty name stands for OpenCV's polynomial of that many coefficients, as in OpenCV's own calibration files.
 
     Returns:
-        The distortion, or None if all coefficients are 0.
+        The distortion, or None if all coefficients are 0 and the model is a pinhole camera then. An equidistant lens
+        is none: its image radius is the focal length times the angle, corrected by the coefficients.
 
     Raises:
         ValueError: the model is unknown, or the coefficients are not those of the model; the text says why.
     """
     values = [float(value) for value in coefficients]
     if not any(values):
-        return None
+        if model != EQUIDISTANT:
+            return None
+        values = [0.0] * 4
     model = model or "rational_polynomial"
     if model not in _COUNTS:
         raise ValueError(f"the distortion model '{model}' is not known; known are {', '.join(_COUNTS)}")

@@ -179,12 +179,32 @@ def test_the_image_that_is_taken(image, p, d, expected):
     assert bool(camera.uncorrected) == ("distortion_ignored" in expected[3])
 
 
-@pytest.mark.parametrize("image, count", [("auto", 1), ("raw", 1), ("rectified", 0)])
-def test_a_fisheye_without_coefficients_is_no_fisheye_and_noted(image, count):
-    """Rectified images are often published so; an ideal fisheye would be too."""
-    notes = read_camera_info(info(p=PLAIN, d=[0.0] * 4, model="equidistant"), image).notes
-    assert [note.reason for note in notes] == ["image_assumed"] * count
-    assert not read_camera_info(info(p=PLAIN, model="equidistant"), image).notes
+@pytest.mark.parametrize("d", [[0.0] * 4, []], ids=["zeros", "empty"])
+@pytest.mark.parametrize(
+    "image, p, expected",
+    [
+        ("auto", FILLED, ("raw", "equidistant", ["image_assumed"])),
+        ("auto", (0, 0, 0, 0), ("raw", "equidistant", ["image_assumed"])),
+        ("auto", OTHER, ("rectified", "", ["image_assumed"])),
+        ("raw", OTHER, ("raw", "equidistant", [])),
+        ("rectified", FILLED, ("rectified", "", [])),
+    ],
+)
+def test_an_ideal_fisheye_has_zeros_for_coefficients(image, p, d, expected):
+    camera = read_camera_info(info(p=p, d=d, model="equidistant"), image)
+    lens = camera.distortion.model if camera.distortion else ""
+    assert (camera.image, lens, [note.reason for note in camera.notes]) == expected
+
+
+@pytest.mark.parametrize("image", ["auto", "raw"])
+def test_persons_before_an_ideal_fisheye_stand_where_they_stand(opened, image):
+    stream = opened(image=image)
+    stream.camera_info(info(d=[0.0] * 4, model="equidistant"))
+    truth = persons_at((4.0, 0.0, 2.0))
+    x, y = (truth[..., :2] / truth[..., 2:]).transpose(2, 0, 1)
+    angle = np.arctan(np.hypot(x, y)) / np.hypot(x, y)
+    xy = np.stack([x * angle, y * angle], axis=-1) * FOCAL + CENTRE
+    np.testing.assert_allclose(root(stream, xy), hips(truth), atol=0.03)
 
 
 def test_a_model_that_is_not_known_is_noted_and_not_corrected(opened):

@@ -93,6 +93,8 @@ def test_a_fisheye_sees_as_far_as_89_degrees():
     "model, d, read",
     [
         ("plumb_bob", [], None),
+        ("equidistant", [], ("equidistant", 4)),
+        ("equidistant", [0.0] * 4, ("equidistant", 4)),
         ("plumb_bob", [0.0] * 5, None),
         ("anything", [0.0] * 3, None),
         ("plumb_bob", [0.1, 0, 0, 0], ("plumb_bob", 12)),

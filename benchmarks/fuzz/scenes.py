@@ -120,8 +120,7 @@ def random_camera(rng: random.Random) -> TrueCamera:
     """Return a camera whose CameraInfo states all that it does."""
     focal = rng.uniform(500, 1300)
     model, d = rng.choice((("plumb_bob", 5), ("rational_polynomial", 8), ("equidistant", 4)))[:2]
-    # A fisheye whose four numbers are zero cannot be told from a lens without distortion.
-    bent = model == "equidistant" or rng.random() < 0.7
+    bent = rng.random() < 0.7
     numbers = [0.0] * d
     if bent:
         numbers = [rng.uniform(-0.06, 0.03) for _ in numbers] if model != "plumb_bob" else numbers
