@@ -4,24 +4,27 @@
 A first walk finds the blocks of the file. Each is loaded when the reading reaches its first log time. So the memory
 does not grow with the file.
 
-The package `mcap` decompresses the chunks and parses descriptions. It comes with the extra `bags`.
+The package `mcap` parses descriptions. It comes with the extra `bags`.
 """
 
 from __future__ import annotations
 
 import functools
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from paul_ros.offline.bag_records import MAX_LOG_TIME, Record, type_name
-from paul_ros.offline.mcap_frames import CHANNEL, CHUNK, FRAME, MESSAGE, MESSAGE_HEAD, SCHEMA, Block, Frames
+from paul_ros.offline.mcap_frames import CHANNEL, CHUNK, CHUNK_HEAD, FRAME, MESSAGE, MESSAGE_HEAD, SCHEMA, Block, Frames
 from paul_ros.offline.time_order import merge_by_time
 
 if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
+_LENGTH = struct.Struct("<Q")
 _MAX_CHUNK_BYTES = 1 << 32  # uncompressed; a damaged size must not take all memory
 
 
@@ -125,18 +128,21 @@ class McapFile:
             raise ValueError("the file ends too early")
         if not block.chunk:
             return memoryview(raw)
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Chunk
-        from mcap.stream_reader import get_chunk_data_stream
-
-        chunk = Chunk.read(ReadDataStream(BytesIO(raw[FRAME.size :])))
-        if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
-            raise ValueError(f"it states a size of {chunk.uncompressed_size} bytes")
-        self.compression = self.compression or chunk.compression
-        content, length = get_chunk_data_stream(chunk, validate_crc=True)
-        if length != chunk.uncompressed_size:
-            raise ValueError(f"it has {length} bytes in place of {chunk.uncompressed_size}")
-        return memoryview(content.read(length))
+        # Parsed here, since `mcap` copies the bytes of a chunk four times: images make chunks large.
+        _, _, size, checksum, length = CHUNK_HEAD.unpack_from(raw, FRAME.size)
+        at = FRAME.size + CHUNK_HEAD.size + length
+        compression = str(raw[at - length : at], "utf-8")
+        at += _LENGTH.size
+        (length,) = _LENGTH.unpack_from(raw, at - _LENGTH.size)
+        if size > _MAX_CHUNK_BYTES:
+            raise ValueError(f"it states a size of {size} bytes")
+        self.compression = self.compression or compression
+        content = _unpacked(compression, memoryview(raw)[at : at + length], size)
+        if checksum and checksum != (found := zlib.crc32(content)):
+            raise ValueError(f"its checksum is {found}, and it states {checksum}")
+        if len(content) != size:
+            raise ValueError(f"it has {len(content)} bytes in place of {size}")
+        return content
 
     def _record(
         self, data: memoryview, start: int, end: int, stream: BinaryIO, wanted: Callable[[str], bool]
@@ -198,6 +204,21 @@ class McapFile:
                 self._channels.setdefault(channel.id, channel)
         except Exception as error:  # as many kinds as in `_load`
             self.problems.append(f"a description of a topic is damaged ({str(error) or type(error).__name__})")
+
+
+def _unpacked(compression: str, packed: memoryview, size: int) -> memoryview:
+    """Return the records of a chunk. The packages come with `mcap`."""
+    if compression == "zstd":
+        import zstandard
+
+        return memoryview(zstandard.decompress(packed, size))
+    if compression == "lz4":
+        import lz4.frame
+
+        return memoryview(lz4.frame.decompress(packed))
+    if compression:
+        raise ValueError(f"its compression is '{compression}', not zstd or lz4")
+    return packed
 
 
 def _inner_frames(data: memoryview) -> Iterator[tuple[int, int, int]]:

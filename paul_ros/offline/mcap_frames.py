@@ -29,7 +29,9 @@ FRAME = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence number, log time and publish time; the data follow."""
 
-_CHUNK_HEAD = struct.Struct("<QQQI")  # first and last log time, size, checksum
+CHUNK_HEAD = struct.Struct("<QQQII")
+"""First and last log time, size and checksum of the records, length of the compression's name."""
+
 _DATA_END_CONTENT = struct.Struct("<I")  # checksum
 _FOOTER_CONTENT = struct.Struct("<QQI")  # start of the summary, start of its offsets, checksum
 _CHECKSUM_BYTES = 4
@@ -177,7 +179,7 @@ class Frames:
     def _take(self, opcode: int, at: int, end: int) -> None:
         """Note a record of the data section; the stream is behind its frame."""
         if opcode == CHUNK:
-            first, last, _, _ = _CHUNK_HEAD.unpack(self._stream.read(_CHUNK_HEAD.size))
+            first, last, *_ = CHUNK_HEAD.unpack(self._stream.read(CHUNK_HEAD.size))
             self.blocks.append(Block(first, last, at, end, True))
         elif opcode == MESSAGE:
             self._take_message(MESSAGE_HEAD.unpack(self._stream.read(MESSAGE_HEAD.size))[2], at, end)
