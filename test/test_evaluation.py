@@ -487,3 +487,22 @@ def test_placeholders_are_hidden(model_file, tmp_path):
     W = S[:, :2].copy()
     W[3, :, 5] = 0
     assert load_sequence(write(tmp_path / "d.npz", S, W=W)).visible.sum() == S.shape[0] * 17 - 1
+
+
+def reconstructed(path, S, focal=600.0):
+    """Save shapes (F,3,P) of metres, seen at 5 m, as a reconstruction of their pixels."""
+    pixels = (focal / 5 * (S - S.mean(2, keepdims=True))).astype(np.float32)
+    frames = len(S)
+    Reconstruction(np.ones(frames, bool), pixels, random_rotations(frames, 0), None, 0.0, 0.0).save(path)
+    return path
+
+
+def test_shapes_of_pixels_are_judged_in_the_metres_of_the_camera(model_file, tmp_path):
+    S = turned(model_file, size=0.3) + [[0], [0], [5]]
+    K = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1.0]])
+    seen = 600 * S[:, :2] / S[:, 2:] + [[320], [240]]
+    truth = write(tmp_path / "truth.npz", S, W=seen, K=K)
+    report, _ = evaluation.evaluate_shapes(reconstructed(tmp_path / "shapes.npz", S), truth)
+    assert report["ne_flip_frame_percent"] < 12, "the perspective, which the shapes do not have"
+    with pytest.raises(DataError, match=r"120 times as large as W of the truth.*K \(3,3\)"):
+        evaluation.evaluate_shapes(tmp_path / "shapes.npz", write(tmp_path / "metres.npz", S))

@@ -319,7 +319,7 @@ def test_only_layouts_that_map_onto_the_model_are_proposed(model_file, make):
     assert_drops(stream, CLOUD, cloud(make, np.ones((1, 17, 2))))
     assert stream.ledger.advice["wrong_point_count"] == (
         "17 keypoints are not a multiple of the layout's 8. Set `layout` to the one your detector "
-        "uses: walker (the model's own, by the path of its file)."
+        "uses: walker (the model's own, by the path of its file), or the path of your own."
     )
     assert_drops(stream, CLOUD, cloud(make, np.ones((1, 25, 2))))
     assert stream.ledger.advice["wrong_point_count"].endswith(

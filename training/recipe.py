@@ -150,7 +150,8 @@ class Recipe:
         fields = {field.name: field for field in dataclasses.fields(cls)}
         unknown = sorted(str(key) for key in settings if key not in fields)
         if unknown:
-            raise RecipeError(f"unknown recipe setting {', '.join(unknown)}; known are {', '.join(fields)}")
+            near = did_you_mean(unknown[0], fields)
+            raise RecipeError(f"unknown recipe setting {', '.join(unknown)}{near or ';'} known are {', '.join(fields)}")
         return cls(**{key: _converted(key, value, fields[key].default) for key, value in settings.items()})
 
     def __post_init__(self) -> None:

@@ -44,8 +44,8 @@ class Role:
         """Raise WrongTopicError if a topic's type cannot be read in this role."""
         if type_name not in self.types:
             raise WrongTopicError(
-                f"{topic} is a {type_name}, not readable as {self.name}: choose another topic with {self.option}, "
-                f"of type {' or '.join(self.types)}"
+                f"{topic} has the type {type_name}, which is not readable as {self.name}: choose another topic with "
+                f"{self.option}, of type {' or '.join(self.types)}"
             )
 
 

@@ -41,6 +41,7 @@ MAX_LATENCY_SECONDS = 10.0
 
 _LATENCIES_KEPT = 1000  # frames, the last half minute at 30 Hz
 _NS = 1e9
+_NO_KEYPOINTS = {"missed", "bad_intrinsics", "depth_encoding"}  # drops of messages that never came, or of other inputs
 
 
 @dataclass(frozen=True)
@@ -232,6 +233,6 @@ def summary(stream: LiftStream) -> str:
 
 
 def _dropped_messages(reasons: Counter[str], stream: LiftStream) -> int:
-    """Return how many drops are messages that came: neither persons nor messages that were lost on the way."""
-    drops = (slug for slug in reasons if slug in stream.ledger.drops and slug != "missed")
+    """Return how many drops are messages of keypoints that came, and so neither persons nor other inputs."""
+    drops = (slug for slug in reasons if slug in stream.ledger.drops and slug not in _NO_KEYPOINTS)
     return sum(reasons[slug] for slug in drops if reason_of(slug, DROP).kind != PERSON)

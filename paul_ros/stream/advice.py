@@ -62,4 +62,5 @@ def wrong_point_count(error: WrongPointCount | UnknownLayout, model: Layout) -> 
             f"{sentence(str(error))} No shipped layout that the model can use has that many: set `layout` to the path "
             "of your own."
         )
-    return f"{sentence(str(error))} Set `layout` to the one your detector uses: {', '.join(names)}."
+    choice = f"{', '.join(names)}, or the path of your own"
+    return f"{sentence(str(error))} Set `layout` to the one your detector uses: {choice}."

@@ -17,6 +17,7 @@ NOTE_REASONS = (
         NOTE,
         "A fault of paul_ros or rclpy: a service request, a timer or an event ended in an error, and the node goes on",
         "Report it with the traceback in the log.",
+        warn_above=AT_ONCE,
     ),
     Reason(
         "image_assumed",
@@ -109,7 +110,7 @@ NOTE_REASONS = (
         "no_stamp",
         NOTE,
         "The keypoints have no stamp, so the time of their arrival is used",
-        "Let the detector copy the header of its image. Until then depth images and transforms are late by its delay.",
+        "Let the detector copy the header of its image. Until then no transforms are sent.",
     ),
     Reason(
         "invalid_stamp",

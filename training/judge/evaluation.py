@@ -24,7 +24,7 @@ from paul_ros.versions import versions
 from training.errors import DataError
 from training.judge.comparison import Comparison, errors
 from training.judge.prediction import CountFrames, Prediction, centred, predict, predict_rigid, rigid_mean
-from training.judge.truth import Sequence, load_sequence
+from training.judge.truth import SAME_UNIT, Sequence, load_sequence
 
 _TIMED_FRAMES = 100
 
@@ -133,11 +133,35 @@ def evaluate_shapes(shapes: str | Path, truth_file: str | Path) -> tuple[dict[st
             "name the file that was reconstructed"
         )
     S = np.zeros(given, np.float32)
-    S[found.used] = found.shapes
+    S[found.used] = in_units_of(truth, found.shapes, found.used, shapes)
     dropped = np.where(found.used, "", TOO_FEW_POINTS).astype(object)
     rigid = predict_rigid(rigid_mean(found.shapes, found.rotations), truth.W, truth.visible)
     compared = Comparison.of(truth, Prediction(S, dropped), rigid, flip=True)
     return _report(compared, shapes=Path(shapes).name, loss=found.loss, seconds=found.seconds), compared
+
+
+def in_units_of(truth: Sequence, shapes: np.ndarray, used: np.ndarray, name: str | Path) -> np.ndarray:
+    """Scale reconstructed shapes (F,3,P) of image units to the units of the truth, if the image is a camera's.
+
+    Each frame has a scale of its own: x and y of its visible points are those of W.
+
+    Raises:
+        DataError: the shapes have other units than the truth, and no camera tells their scale.
+    """
+    seen = truth.visible[used][:, None]
+    image = np.where(seen, centred(truth.W, truth.visible)[used], 0.0)
+    found = np.where(seen, shapes[:, :2], 0.0)
+    scale = (image * found).sum((1, 2)) / np.maximum((found * found).sum((1, 2)), 1e-300)
+    low, high = SAME_UNIT
+    if low <= (ratio := float(np.median(scale))) <= high:
+        return shapes
+    if not (truth.has_camera and (scale > 0).all()):
+        raise DataError(
+            f"the shapes in '{name}' are {1 / ratio if ratio else np.inf:.3g} times as large as W of the truth: they "
+            "have different units, such as pixels and metres. Name the file that was reconstructed; save its camera "
+            "matrix as K (3,3) if its W is in pixels and its S in metres"
+        )
+    return shapes * scale[:, None, None]
 
 
 def _report(compared: Comparison, **about: object) -> dict[str, Any]:

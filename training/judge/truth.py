@@ -16,7 +16,7 @@ from paul_ros.placeholders import placeholders
 from paul_ros.placement import centred_view
 from training.errors import DataError
 
-_SCALES = (0.8, 1.25)
+SAME_UNIT = (0.8, 1.25)
 """Size of W over that of S seen from the front, if both have one unit; with 20 % noise on W it is 1.02."""
 
 _LEAST_LIKENESS = 0.5
@@ -40,6 +40,7 @@ class Sequence:
         S: (F,3,P) truth in the camera frame and the unit of W, float32 or float64; NaN where it is unknown.
         edges: (E,2) points that pictures join by lines; may be empty.
         metres: whether S is in metres.
+        has_camera: whether W was saved as pixels or rays of a camera.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Sequence:
     S: np.ndarray
     edges: np.ndarray
     metres: bool
+    has_camera: bool = False
 
     @property
     def present(self) -> np.ndarray:
@@ -173,6 +175,7 @@ def _sequence(
         S=S.astype(_floating(S), copy=False),
         edges=edges,
         metres=_is_true(metres),
+        has_camera=camera is not None,
     )
 
 
@@ -223,7 +226,7 @@ def _check_units(W: np.ndarray, S: np.ndarray, known: np.ndarray, path: Path, ha
             f"W in '{path}' is no view of S along its z axis: save S in the frame of the camera (x right, y down, z "
             "forward)"
         )
-    low, high = _SCALES
+    low, high = SAME_UNIT
     if low <= scale <= high:
         return
     if has_camera:
