@@ -201,7 +201,7 @@ def test_replay(model_file, tmp_path):
 @pytest.mark.parametrize(
     "layout, shown, clue",
     [
-        ("human", 17, "Set --layout to the one your detector uses: coco17, h36m17."),
+        ("human", 17, "Set --layout to the one your detector uses: coco17, h36m17, or the path of your own."),
         ("coco17", 3, "too few of its keypoints are visible"),
         ("coco17", 17, ""),
     ],
@@ -244,7 +244,10 @@ def test_half_a_bag(model_file, tmp_path):
         (["replay", ONE, "--output-layout", "body25"], "--output-layout 'body25': the model's layout"),
         (["replay", ONE, "--layout", "coco71"], "did you mean 'coco17'?"),
         (["replay", ONE, "--topic", "/skeletons"], "no messages on /skeletons"),
-        (["replay", ONE, "--topic", "/camera_info"], "/camera_info is a sensor_msgs/msg/CameraInfo, not readable"),
+        (
+            ["replay", ONE, "--topic", "/camera_info"],
+            "/camera_info has the type sensor_msgs/msg/CameraInfo, which is not readable",
+        ),
         (["replay", ONE, "-o", "/proc/nothing/out.mcap"], "cannot write"),
         (["inspect", "zzz"], "no model or layout 'zzz'. Shipped models: human; shipped layouts: ap10k17"),
         (["inspect", "coc17"], "no model or layout 'coc17', did you mean layout 'coco17'?"),

@@ -49,7 +49,7 @@ def test_a_folder_without_data_is_explained(tmp_path):
         prepare(options)
 
 
-@pytest.mark.parametrize("name, clue", [("old.bag", "rosbags-convert"), ("take/rec_0.mcap", "`paul replay .*/take`")])
+@pytest.mark.parametrize("name, clue", [("old.bag", "rosbags-convert"), ("take/rec_0.mcap", "give that, `.*/take`")])
 def test_a_folder_gets_the_advice_that_replay_gives(tmp_path, name, clue):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")

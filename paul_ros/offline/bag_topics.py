@@ -24,6 +24,9 @@ _AMBIGUOUS = ("sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray")
 """Types that hold many things beside 2D keypoints."""
 
 
+_NAMED_TYPES = 3  # types that an error names
+
+
 @dataclass(frozen=True)
 class Role:
     """The use of a topic.
@@ -45,7 +48,7 @@ class Role:
         if type_name not in self.types:
             raise WrongTopicError(
                 f"{topic} has the type {type_name}, which is not readable as {self.name}: choose another topic with "
-                f"{self.option}, of type {' or '.join(self.types)}"
+                f"{self.option}, of type {_some(self.types)}"
             )
 
 
@@ -180,3 +183,9 @@ def _listed(topics: Sequence[str]) -> str:
 
 def _namespace(topic: str) -> str:
     return topic.rpartition("/")[0]
+
+
+def _some(types: Collection[str]) -> str:
+    """Return the first types as text, and how many more there are."""
+    named = " or ".join(list(types)[:_NAMED_TYPES])
+    return f"{named} or {len(types) - _NAMED_TYPES} more" if len(types) > _NAMED_TYPES else named
