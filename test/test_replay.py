@@ -348,7 +348,7 @@ def test_nothing_to_lift(short, model_file, tmp_path, change, clue):
 @pytest.mark.parametrize(
     "topics, clue",
     [
-        (Topics(keypoints="/camera_info"), "sensor_msgs/msg/CameraInfo, not readable as keypoints.*--topic"),
+        (Topics(keypoints="/camera_info"), "sensor_msgs/msg/CameraInfo, which is not readable as keypoints.*--topic"),
         (Topics(camera_info="/ground_truth/poses"), "--camera-info-topic"),
         (Topics(truth="/keypoints"), "--ground-truth-topic"),
     ],
