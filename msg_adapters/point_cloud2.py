@@ -9,6 +9,7 @@ types, steps and byte order are read from the message.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -171,6 +172,10 @@ def _persons_by_id(points: np.ndarray) -> int:
 
 def _ids(column: np.ndarray) -> tuple[str, ...]:
     """Return one id per person from the (N, P) field person_id: the first finite number that is not negative."""
+    # Detectors fill the whole row, so the first column alone answers nearly always.
+    first_column = as_float64(column[:, 0]).tolist()
+    if all(0 <= value < math.inf for value in first_column):
+        return tuple(f"{value:.0f}" for value in first_column)
     column = as_float64(column)
     known = np.isfinite(column) & (column >= 0)
     first = np.take_along_axis(column, known.argmax(axis=1)[:, None], axis=1)[:, 0]
