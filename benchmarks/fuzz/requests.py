@@ -7,14 +7,12 @@ returned them: every request is answered, a refusal changes nothing, and every f
 
 from __future__ import annotations
 
-import contextlib
 import os
 import random
 import string
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +60,6 @@ class Node:
         )
         from sensor_msgs.msg import PointCloud2
 
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-        os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
         environment = {key: value for key, value in os.environ.items() if key != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
         self.log = folder / "lifter.log"
         with open(self.log, "wb") as log:
@@ -97,8 +92,12 @@ class Node:
             PoseArray, "lifter/poses", lambda message: self.lifted.append(message.header.stamp.sec), 100
         )
         self.sent = 0
-        for client in self.clients.values():
-            self._until(client.service_is_ready, "a service")
+        try:
+            for client in self.clients.values():
+                self._until(client.service_is_ready, "a service")
+        except WrongOutput:
+            self.close()
+            raise
 
     def close(self) -> None:
         """End the node and the clients."""
@@ -156,16 +155,6 @@ def _cloud(seconds: int, rng: random.Random) -> Any:
     head = make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
     xy = np.array([[pose[name] for name in COCO]])
     return outputs.keypoints_cloud(make, head, xy, np.full(xy.shape[:2], 0.9), ["1"])
-
-
-@contextlib.contextmanager
-def running_node(folder: Path) -> Iterator[Node]:
-    """Run a node during the block."""
-    node = Node(folder)
-    try:
-        yield node
-    finally:
-        node.close()
 
 
 def request_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, where: str) -> None:

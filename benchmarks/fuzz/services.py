@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import gc
 import math
-import os
 import random
 import string
 import time
@@ -44,7 +43,6 @@ FIELDS = ("bool", "integer", "double", "string", "byte_array", "bool_array", "in
 
 def service_session(bench: Bench, rng: random.Random, tally: Tally, cases: int, where: str) -> None:
     """Send requests to one node, with frames between them; each must be answered as its state and values demand."""
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     # rclpy's own imports.
     warnings.simplefilter("ignore", DeprecationWarning)
     import rclpy
