@@ -93,8 +93,9 @@ class Node:
         )
         self.sent = 0
         try:
-            for client in self.clients.values():
+            for name, client in self.clients.items():
                 self._until(client.service_is_ready, "a service")
+                self._until(lambda: self._answers(name), f"the first answer of {name}")
         except WrongOutput:
             self.close()
             raise
@@ -106,6 +107,15 @@ class Node:
         self.node.destroy_node()
         if self._owns_context:
             self._rclpy.shutdown()
+
+    def _answers(self, name: str) -> bool:
+        """Send an empty request, which changes nothing; return whether it is answered soon.
+
+        The middleware may lose answers until it has matched both directions.
+        """
+        future = self.clients[name].call_async(self.request(name))
+        self._rclpy.spin_until_future_complete(self.node, future, timeout_sec=1.0)
+        return bool(future.done())
 
     def call(self, name: str, request: Any) -> Any:
         """Return the response to a request.
