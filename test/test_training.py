@@ -217,7 +217,7 @@ def test_frames_with_too_few_points_are_left_out_and_counted(tmp_path):
         ("nonsense=1", "unknown"),
         ("batch", "key=value"),
         ("width=-4", "positive"),
-        ("hide=0.3", "unknown recipe setting hide; known are bottleneck"),
+        ("hide=0.3", "unknown recipe setting hide.* known are bottleneck"),
         ("seed=-1", "seed must be at least 0"),
         ("seed=1e12", "seed must be at most 4294967295"),
         ("batch=1e9", "batch must be at most"),
