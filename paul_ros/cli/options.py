@@ -96,8 +96,8 @@ def add_image(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--image",
         choices=IMAGES,
-        help="the image that the detector saw: rectified (P of the camera), raw (K; the distortion D is corrected), "
-        "or auto: raw if D is not zero and P is empty or equals K (default: auto)",
+        help="the image that the detector saw: rectified (the camera's P), raw (K and D), or auto, which decides by P "
+        "and D (default: auto)",
     )
 
 
