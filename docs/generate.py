@@ -95,8 +95,8 @@ def reasons() -> str:
 
 def options() -> str:
     """Return a table of the options of `paul replay` that stand for parameters and topics of the node."""
-    from paul_ros.cli.advice import TOPICS, in_options
     from paul_ros.cli.launcher import build_parser
+    from paul_ros.stream.option_advice import TOPICS, in_options
     from paul_ros.stream.parameters import DEFAULTS
 
     arguments = vars(build_parser(["replay"]).parse_args(["replay", "BAG"]))

@@ -40,28 +40,30 @@ class MessageError(ValueError):
         self.reason = reason
 
 
-class WrongPointCount(MessageError):
-    """The number of keypoints in a message differs from the layout's.
+class PointCountError(MessageError):
+    """A message whose number of keypoints does not tell how to read it.
 
     Attributes:
         fits: tells if a layout with the given number of keypoints would fit.
     """
 
-    def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
-        super().__init__("wrong_point_count", advice)
+    def __init__(self, reason: str, advice: str, fits: Callable[[int], bool]) -> None:
+        super().__init__(reason, advice)
         self.fits = fits
 
 
-class UnknownLayout(MessageError):
-    """A list of keypoints that may be one person or several, while the layout is unknown.
-
-    Attributes:
-        fits: tells if a layout with the given number of keypoints would fit.
-    """
+class WrongPointCount(PointCountError):
+    """The number of keypoints in a message differs from the layout's."""
 
     def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
-        super().__init__("layout_unknown", advice)
-        self.fits = fits
+        super().__init__("wrong_point_count", advice, fits)
+
+
+class UnknownLayout(PointCountError):
+    """A list of keypoints that may be one person or several, while the layout is unknown."""
+
+    def __init__(self, advice: str, fits: Callable[[int], bool]) -> None:
+        super().__init__("layout_unknown", advice, fits)
 
 
 class Note(NamedTuple):

@@ -22,6 +22,7 @@ from msg_adapters.keypoints import (
     Keypoints2D,
     MessageError,
     Note,
+    PointCountError,
     Source,
     UnknownLayout,
     WrongPointCount,
@@ -172,7 +173,7 @@ def _line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _fits(error: WrongPointCount | UnknownLayout, points: int) -> bool:
+def _fits(error: PointCountError, points: int) -> bool:
     try:
         return bool(error.fits(points))
     except Exception:

@@ -18,6 +18,7 @@ from paul_ros.layout import Layout
 from paul_ros.placement import centred_view
 from paul_ros.stream.image_bounds import ImageBounds
 from paul_ros.stream.ledger import Ledger
+from paul_ros.stream.option_advice import in_options
 from paul_ros.wording import quantity
 from training.data import RawFrames
 from training.errors import DataError
@@ -25,6 +26,7 @@ from training.errors import DataError
 if TYPE_CHECKING:
     from paul_ros.offline.bag_reader import Recording
 
+_OPTIONS = ("image", "camera_info_topic")  # of `paul train`, which the notes may name
 _JITTER = 0.01
 """Largest difference of the intrinsics of one camera, over its focal length."""
 
@@ -113,7 +115,7 @@ def read_bag(
 def _camera_notes(cameras: _Cameras, without_ray: int) -> tuple[str, ...]:
     """Return notes of what was assumed about the cameras, and of points that their distortion hides."""
     assumed = dict.fromkeys(note.text for _, camera in cameras.intrinsics for note in camera.notes)
-    notes = [_in_options(text) for text in assumed]
+    notes = [in_options(text, _OPTIONS) for text in assumed]
     if without_ray:
         notes.append(
             f"{quantity(without_ray, 'keypoint')} hidden: the distortion model has no ray there. If they are many, "
@@ -129,14 +131,7 @@ def _bounds_notes(
     bounds, ledger = ImageBounds(), Ledger()
     for message in messages:
         bounds.check(message, min_confidence, size, ledger)
-    return tuple(_in_options(text) for text in ledger.advice.values())
-
-
-def _in_options(advice: str) -> str:
-    """Put the options of `paul train` in place of the node's parameters and topics."""
-    for name, option in (("Remap `camera_info`", "Set --camera-info-topic"), ("`image`", "--image")):
-        advice = advice.replace(name, option).replace(name[0].lower() + name[1:], option[0].lower() + option[1:])
-    return advice
+    return tuple(in_options(text, _OPTIONS) for text in ledger.advice.values())
 
 
 def _rays(xy: np.ndarray, visible: np.ndarray, cameras: list[msg_adapters.Intrinsics]) -> np.ndarray:

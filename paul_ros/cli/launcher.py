@@ -14,10 +14,10 @@ import sys
 from collections.abc import Collection
 
 from paul_ros import __version__
-from paul_ros.cli.advice import in_options
 from paul_ros.cli.options import HelpFormatter
 from paul_ros.cli.parser import Parser
 from paul_ros.signals import stoppable
+from paul_ros.stream.option_advice import in_options
 
 COMMANDS = {
     "lift": "lift arrays of 2D keypoints (.npz, .csv, .json), without ROS",

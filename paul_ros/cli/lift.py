@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from paul_ros.cli.advice import in_options
 from paul_ros.cli.options import (
     Commands,
     HelpFormatter,
@@ -23,6 +22,7 @@ from paul_ros.cli.options import (
 )
 from paul_ros.cli.output import STDOUT, check_files, open_output, output_path
 from paul_ros.cli.progress import progress
+from paul_ros.stream.option_advice import in_options
 from paul_ros.wording import quantity
 
 if TYPE_CHECKING:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from paul_ros.cli.advice import in_options
 from paul_ros.cli.options import (
     PICTURES,
     Commands,
@@ -21,6 +20,7 @@ from paul_ros.cli.options import (
 )
 from paul_ros.cli.output import STDOUT, check_files, check_suffix, publish
 from paul_ros.cli.progress import progress
+from paul_ros.stream.option_advice import in_options
 
 _DESCRIPTION = """\
 Lift every 2D keypoint message of a bag through the code of the node. Equal input gives equal output.

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from msg_adapters import Intrinsics, UnknownLayout, WrongPointCount
+from msg_adapters import Intrinsics, PointCountError
 from paul_ros.layout import Layout, layout_names
 from paul_ros.stream.layout_search import candidates
 
@@ -52,7 +52,7 @@ def unlike_the_model(model: str, layout: str) -> str:
     )
 
 
-def wrong_point_count(error: WrongPointCount | UnknownLayout, model: Layout) -> str:
+def wrong_point_count(error: PointCountError, model: Layout) -> str:
     """Say which layouts have as many points as a message: the model's own, and shipped ones that map onto it."""
     shipped = layout_names()
     fitting = {layout.name: None for layout in candidates(model) if error.fits(len(layout.names))}

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import msg_adapters
-from msg_adapters import Intrinsics, Keypoints2D, MessageError, Source, UnknownLayout, WrongPointCount
+from msg_adapters import Intrinsics, Keypoints2D, MessageError, PointCountError, Source
 from msg_adapters.cdr import CloudReader
 from paul_ros.body_axes import left_and_up
 from paul_ros.layout import Layout, load_layout
@@ -234,7 +234,7 @@ class LiftStream:
         """Turn any error about a message into a counted drop; the only place that does."""
         try:
             yield
-        except (WrongPointCount, UnknownLayout) as error:
+        except PointCountError as error:
             self.ledger.drop(error.reason, advice.wrong_point_count(error, self.lifter.model.layout))
         except MessageError as error:
             self.ledger.drop(error.reason, advice.sentence(str(error)))

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Collection
 
 TOPICS = {"keypoints": "topic", "camera_info": "camera_info_topic", "depth": "depth_topic"}
 """Topic of the node -> name of the option that chooses it in a bag."""
@@ -13,14 +12,14 @@ TOPICS = {"keypoints": "topic", "camera_info": "camera_info_topic", "depth": "de
 _NAME = re.compile(r"(?P<remap>[Rr]emap )?(?:the parameter )?`(?P<name>\w+)`")
 
 
-def in_options(advice: str, arguments: Mapping[str, Any]) -> str:
+def in_options(advice: str, arguments: Collection[str]) -> str:
     """Replace parameters and topics of the node, which stand in backticks, by the options of a command.
 
     "Set `layout`" becomes "Set --layout", and "Remap `depth` to" becomes "Set --depth-topic to".
 
     Args:
         advice: one sentence or more.
-        arguments: the command's parsed arguments by name. A name that is no option of the command stays as it is.
+        arguments: names of the command's arguments. A name that is no option of the command stays as it is.
     """
     from paul_ros.stream.parameters import DEFAULTS
 

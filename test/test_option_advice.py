@@ -7,9 +7,9 @@ import re
 
 import pytest
 
-from paul_ros.cli.advice import TOPICS, in_options
 from paul_ros.cli.launcher import build_parser
 from paul_ros.errors import PaulError
+from paul_ros.stream.option_advice import TOPICS, in_options
 from paul_ros.stream.parameters import DEFAULTS, checked
 from paul_ros.stream.reasons import REASONS
 
